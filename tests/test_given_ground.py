@@ -11,7 +11,6 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.classifier.model import load_model
 from pdal_stages.cli import main
 from pdal_stages.pipeline.classify_request import ClassifyRequest
-from pdal_stages.pipeline.expansion import settle_upstream
 from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.stages.registry import stage_from
 from pdal_stages.terrain.heights import filtered_ground
@@ -144,30 +143,12 @@ def test_without_ground_there_is_none_to_take(tmp_path, capsys):
 
 
 @pytest.mark.pdal
-@pytest.mark.parametrize("heights", ["filters.hag_nn", "filters.hag_delaunay"])
-@pytest.mark.parametrize("ground", [[{"type": "filters.smrf"}], []])
-def test_the_shipped_model_after_heights_of_pdal(edited, tmp_path, ground, heights):
-    """Ground by PDAL, or as the file has it: a warning, and what the model reads beside heights is made of class 2."""
-    out = tmp_path / "out.laz"
+def test_the_shipped_model_after_heights_of_pdal(edited, tmp_path):
+    """What they do not make is named, with the stage that takes their ground."""
+    nearest = {"type": "filters.hag_nn"}
     apply = {"type": "filters.modelclassifier", "model": "standard"}
-    done = ps.run_pipeline([str(edited), *ground, {"type": heights}, apply, str(out)])
-    message = " ".join(done.messages)
-    assert (
-        "trained on other heights" in message and "from points of class 2 Ground, Height" in message
-    )
-    assert {2, 5, 6} <= set(np.asarray(laspy.read(out).classification).tolist())
-
-
-def test_after_csf_as_well():
-    """PDAL 2.2 runs out of memory in filters.csf on some clouds, so the stage alone is asked."""
-    stage = stage_from({"type": "filters.modelclassifier", "model": "standard"})
-    reach = stage.halo_m()
-    before = [({"type": name}, {"HeightAboveGround": "double"}) for name in ("filters.csf", "filters.hag_nn")]  # fmt: skip
-    placed, _ = settle_upstream(stage, before)
-    warning = placed.check_upstream()
-    assert "filters.csf" in warning and "from points of class 2 Ground, Height" in warning
-    assert placed.reads() == ["HeightAboveGround"] and placed.halo_m() > reach
-    assert "Ground" in stage.reads() and stage.halo_m() == reach
+    with pytest.raises(StageError, match=r"'Ground' is missing.*\n?.*filters\.hag_morphological"):
+        ps.run_pipeline([str(edited), nearest, apply, str(tmp_path / "out.laz")])
 
 
 @pytest.mark.pdal

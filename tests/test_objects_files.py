@@ -153,16 +153,6 @@ def test_settings_and_metadata(folder, tmp_path):
         assert cli.main(["objects", *files, *more]) == 0
         return json.loads((tmp_path / "m.json").read_text())
 
-    checked = run()["objects"]["buildings"]
-    reason = max(checked["reasons"], key=checked["reasons"].get)
-    left = run(f"--filters.objects.refuse={reason}")
-    assert left["refused"]["objects"] >= checked["reasons"][reason] > 0
-    assert (
-        left["objects"]["buildings"]["objects"] == checked["objects"] - checked["reasons"][reason]
-    )
-    assert reason not in left["objects"]["buildings"]["reasons"]
-    shown, _, _ = layer(tmp_path / "t.gpkg", "buildings")
-    assert len(shown["object_id"]) == left["objects"]["buildings"]["objects"]
     plain, two = run(), run("--writers.objects.tree_height=9", "--cell", "1", "--outlines", "cells")
     assert two["settings"]["tree_height"] == 9 and two["settings"]["cell"] == 1
     assert two["objects"]["trees"]["objects"] < plain["objects"]["trees"]["objects"]

@@ -1,4 +1,4 @@
-"""``filters.objects`` in real pipelines: dimensions, tiles, `where`, refusals, errors."""
+"""``filters.objects`` in real pipelines: dimensions, tiles, `where`, errors."""
 
 from __future__ import annotations
 
@@ -75,21 +75,17 @@ def test_a_building_longer_than_what_a_tile_sees(tmp_path):
     np.testing.assert_array_equal(whole["ObjectID"], tiled["ObjectID"])
 
 
-def test_where_and_refusals(town):
+def test_where(town):
     las = laspy.read(town)
     points = {"X": las.x, "Y": las.y, "Z": las.z, "Classification": np.asarray(las.classification)}
     half = run_stage(points, where="X < 500050 || Classification == 2")
     ids = half["ObjectID"]
     assert not ids[(points["X"] >= 500050)].any() and ids[points["X"] < 500050].any()
-    refused = run_stage(points, refuse=["small", "no facade"], refused_class=64)
-    gone = np.asarray(refused["Classification"]) == 64
-    assert gone.any() and not refused["ObjectID"][gone].any()
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"refuse": ["smal"]}, "Did you mean"),
         ({"buildings": [2]}, "class 2 cannot stand for"),
         ({"cell": 0}, "cell"),
     ],

@@ -106,19 +106,14 @@ def test_octrees_are_read_in_tiles_too(tmp_path, run):
     assert whole == tiles
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        (
-            "--writers.classifiermodel.groups=PointSourceId",
-            "--writers.classifiermodel.where=HeightAboveGround < 9",
-        ),
-        ("--writers.classifiermodel.survey=PointSourceId",),
-    ],
-    ids=["groups", "surveys"],
-)
-def test_with_other_options_too(town, tmp_path, run, more):
-    (whole, tiles), _ = both(town, tmp_path, run, *more)
+def test_with_other_options_too(town, tmp_path, run):
+    (whole, tiles), _ = both(
+        town,
+        tmp_path,
+        run,
+        "--writers.classifiermodel.groups=PointSourceId",
+        "--writers.classifiermodel.where=HeightAboveGround < 9",
+    )
     assert whole == tiles
 
 

@@ -5,9 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pdal_stages as ps
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
-from pdal_stages.features import compute_features
 from pdal_stages.features.voxels import represent
 
 
@@ -119,25 +117,3 @@ def test_tile_is_the_whole(model):
     assert not near.all()
     tile = model.predict(xyz[near], {})
     assert np.array_equal(tile.reliability[core[near]], whole.reliability[core])
-
-
-@pytest.mark.pdal
-def test_features_of_dense_clouds(pdal_module):
-    """``filters.multiscalefeatures`` with ``voxel``: those of the cloud of representatives."""
-    xyz = crowd(2)
-    few = represent(xyz, 0.25)
-    array = np.zeros(len(xyz), [("X", "f8"), ("Y", "f8"), ("Z", "f8")])
-    for axis, name in enumerate("XYZ"):
-        array[name] = xyz[:, axis]
-    options = {"neighborhoods": "s1,k10", "feature_set": "Linearity", "voxel": 0.25}
-    stage = ps.Filter.multiscalefeatures(**options, where="X < 600006")
-    job = pdal_module.Pipeline(stage.stages, arrays=[array])
-    job.execute()
-    result = job.arrays[0]
-    points, place = few.members(np.arange(len(few.rows)))
-    plain = compute_features(xyz[few.rows], neighborhoods="s1,k10", feature_set="Linearity")
-    inside = xyz[points, 0] < 600_006
-    assert np.array_equal(
-        result["Linearity_k10"][points[inside]], plain["Linearity_k10"][place[inside]]
-    )
-    assert (result["Linearity_k10"][points[~inside]] == 0).all()

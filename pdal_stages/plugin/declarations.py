@@ -17,7 +17,7 @@ _KINDS = {
     "number": "Number",
     "integer": "Integer",
     "boolean": "Boolean",
-    **dict.fromkeys(("list", "numbers", "bands", "codes", "selection"), "List"),
+    **dict.fromkeys(("list", "numbers", "codes", "selection"), "List"),
 }
 
 

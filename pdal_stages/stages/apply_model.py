@@ -24,11 +24,10 @@ from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
-from .base import WHOLE_CLOUD, Stage, StageContext
+from .base import Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
 from .points import Points, class_counts
-from .preprocessing import GROUND_OF_PDAL, HEIGHTS_OF_PDAL, as_json, same, with_given_ground
-from .registry import stage_type
+from .preprocessing import as_json, same, with_given_ground
 
 #: Dimension of the height above ground.
 HEIGHT = "HeightAboveGround"
@@ -80,11 +79,12 @@ class ApplyModel(Stage, settings=PredictionOptions):
         "Points that are neighbors but keep their class, written as for ignore; default: 12, "
         "overlap of strips, which classifying would overwrite"
     )
-    vegetation_heights: tuple[float, float] | None = option(
-        "bands",
-        None,
+    vegetation_heights: list[float] = option(
+        "numbers",
+        (),
         "Two heights in meters, e.g. 0.5,2: vegetation (5) below them becomes low (3) and medium "
         "(4)",
+        *(0, 1000),  # nothing grows so high: such a height is in another unit
         may_be_empty=True,
     )
     mark: str = option(
@@ -123,7 +123,14 @@ class ApplyModel(Stage, settings=PredictionOptions):
                 found=f"{self.model_file}, a forest",
                 cure="Use 'margin'",
             )
-        if self.vegetation_heights and (
+        heights = self.vegetation_heights
+        if heights and not (len(heights) == 2 and 0 < heights[0] < heights[1]):
+            raise OptionError(
+                "option 'vegetation_heights' must be two heights in meters, the lower one first",
+                found=", ".join(map(str, heights)),
+                cure="For example 0.5,2",
+            )
+        if heights and (
             HIGH_VEGETATION not in codes or {LOW_VEGETATION, MEDIUM_VEGETATION} & set(codes)
         ):
             raise OptionError(
@@ -163,39 +170,15 @@ class ApplyModel(Stage, settings=PredictionOptions):
         fits = not trained or not self.upstream or same(self.upstream, trained)
         if fits or (self.given_ground and same(self.upstream, with_given_ground(trained))):
             return None
-        names = ", ".join(self.made_from_ground)
         return (
             f"{self.type}: the model was trained on other heights than this pipeline makes. "
-            f"Trained on: {as_json(trained)}. Here: "
-            f"{as_json(self.upstream)}{f', and from points of class 2 {names}' if names else ''}. "
+            f"Trained on: {as_json(trained)}. Here: {as_json(self.upstream)}. "
             "Expect lower accuracy, or use the former"
         )
 
-    @property
-    def made_from_ground(self) -> list[str]:
-        """Return the dimensions that this stage computes itself from points of class 2.
-
-        The model needs them beside the heights, which PDAL's stages measured from class 2.
-        """
-        of_pdal = GROUND_OF_PDAL + HEIGHTS_OF_PDAL
-        by_pdal = all(stage["type"] in of_pdal for stage in self.upstream)
-        if not self.upstream or not by_pdal or len(self.preparation) != 1:
-            return []
-        created = self._of_ground.creates().keys() - {HEIGHT}
-        return [name for name in self.model.required_dimensions if name in created]
-
-    @cached_property
-    def _of_ground(self) -> Any:
-        """Return the stage of the model's preprocessing, for ground of class 2."""
-        (stage,) = with_given_ground(self.preparation)
-        kind = stage_type(stage.pop("type"))
-        units = {name: getattr(self, name) for name in ("horizontal_unit", "vertical_unit")}
-        return kind({**stage, **units, "threads": self.threads})
-
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
-        computed = self.made_from_ground
-        names = [name for name in self.model.required_dimensions if name not in computed]
+        names = [*self.model.required_dimensions]
         if self.vegetation_heights or self.given_ground:
             names.append(HEIGHT)
         return list(dict.fromkeys(names))
@@ -210,8 +193,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
-        more = self._of_ground.halo_m() if self.made_from_ground else 0.0
-        return self.model.halo_m + more
+        return self.model.halo_m
 
     def written_classes(self) -> set[int]:
         """Return the class codes that may be written."""
@@ -238,8 +220,6 @@ class ApplyModel(Stage, settings=PredictionOptions):
         current = points.class_codes
         if self.given_ground:
             kept = kept | (current == GROUND)
-        if missing := [name for name in self.made_from_ground if name not in points.arrays]:
-            self._add_from_ground(points, missing)
         points.tally("kept", inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         dimensions = {
@@ -297,15 +277,6 @@ class ApplyModel(Stage, settings=PredictionOptions):
             for name, column in values.items():
                 values[name] = np.where(points.mask, column, points.arrays[name])
         return values
-
-    def _add_from_ground(self, points: Points, names: list[str]) -> None:
-        """Compute dimensions from the points of class 2, as the model's own stage would."""
-        stage = self._of_ground
-        created = {name: np.zeros(points.count, np.float32) for name in stage.creates()}
-        arrays = {**points.arrays, **created}
-        seen = stage.points(arrays, wkt=points.wkt, legacy_flags=points.legacy_flags)
-        results = stage.run(seen, WHOLE_CLOUD)
-        points.arrays = {**points.arrays, **{name: results[name] for name in names}}
 
     def _may_be_ground(self, points: Points) -> NDArray[np.bool_]:
         """Return which points (n,) are near enough to the ground that is given."""

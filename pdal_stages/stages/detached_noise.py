@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from ..base.asprs import NOISE
 from ..terrain.noise import REACH, detached_noise
 from .base import ClassStage, StageContext
-from .options import code_option, option
+from .options import option
 from .points import Points, class_counts
 
 
@@ -42,8 +42,6 @@ class DetachedNoise(ClassStage):
         exclusive=True,
         unit="m",
     )
-    low_class: int = code_option(NOISE[0], "Class code of low noise")
-    high_class: int = code_option(NOISE[1], "Class code of high noise")
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
@@ -51,7 +49,7 @@ class DetachedNoise(ClassStage):
 
     def written_classes(self) -> set[int]:
         """Return the class codes that may be written."""
-        return {self.low_class, self.high_class}
+        return set(NOISE)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Mark noise."""
@@ -62,9 +60,8 @@ class DetachedNoise(ClassStage):
         if points.mask is not None:
             noise[~points.mask] = 0
         codes = points.class_codes.copy()
-        targets = {"low": self.low_class, "high": self.high_class}
-        for code, (name, target) in zip(NOISE, targets.items(), strict=True):
-            codes[noise == code] = target
+        codes[noise != 0] = noise[noise != 0]
+        for code, name in zip(NOISE, ("low", "high"), strict=True):
             points.tally(name, noise == code)
         if noise.any():
             points.report.figures["classes"] = class_counts(codes[noise != 0])

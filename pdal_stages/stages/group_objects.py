@@ -10,10 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import checks
 from ..base.errors import StageError
-from ..base.grid import places_among
-from ..objects.attributes import REASONS
 from ..objects.cells import (
     CLASSES,
     MIN_POINTS_PER_CELL,
@@ -26,7 +23,7 @@ from ..objects.detect import find_objects
 from ..objects.raster_view import MARGIN
 from ..objects.results import Objects, ObjectSettings
 from .base import Stage, StageContext
-from .options import Selection, code_option, ignore_option, option
+from .options import Selection, ignore_option, option
 from .points import Points
 
 #: Option -> kind of object whose class codes it lists.
@@ -51,13 +48,6 @@ class ObjectOptions:
     trees: list[int] = _codes("trees", "vegetation that trees are looked for in")
     wires: list[int] = _codes("wires", "wires")
     decks: list[int] = _codes("decks", "bridge decks")
-    refuse: list[str] = option(
-        "list",
-        (),
-        "Reject objects with any of these reasons to be checked (filters.objects: their points "
-        f"get refused_class); they are counted: {', '.join(REASONS)}",
-        may_be_empty=True,
-    )
     ignore: Selection = ignore_option("Points that belong to no object")
 
     options: dict[str, Any]
@@ -76,8 +66,6 @@ class ObjectOptions:
     def check(self) -> None:
         """Refuse options that contradict each other."""
         kind_of_code(self.classes)
-        for name in self.options["refuse"]:
-            checks.one_of("a reason in option 'refuse'", name, REASONS)
 
     def cells(self, points: Points, context: StageContext) -> Cells:
         """Return cells with the points that may belong to objects, or are ground.
@@ -128,11 +116,7 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
         "177-190)"
     )
     where_help = "Points outside form no object, and keep what they have"
-    counts = {"refused_points": "points of rejected objects (refuse)"}
     open_ended = True  # a building may be larger than the surroundings of a tile
-    refused_class: int = code_option(
-        1, "Class code for the points of objects that 'refuse' rejects"
-    )
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
@@ -140,11 +124,7 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
 
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""
-        return {"ObjectID": "uint64_t", **({"Classification": "uint8_t"} if self.refuse else {})}
-
-    def written_classes(self) -> set[int]:
-        """Return the class codes that may be written."""
-        return {self.refused_class} if self.refuse else set()
+        return {"ObjectID": "uint64_t"}
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
@@ -180,22 +160,10 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Find objects and number their points."""
         objects = self._find(points, context)
-        ids = self._ids(objects, points)
-        out: dict[str, NDArray] = {"ObjectID": ids}
+        ids = self._ids(objects, points).astype(np.uint64)
         points.report.figures |= {
             kind: counts for kind, counts in objects.summary().items() if counts["objects"]
         }
-        if self.refuse:
-            refused = np.zeros(points.count, bool)
-            for table in filter(len, objects.tables.values()):
-                place, there = places_among(table.ids, ids)
-                refused[there] = table.has_reason(self.refuse)[place[there]]
-            codes = points.class_codes.copy()
-            codes[refused] = self.refused_class
-            ids[refused] = 0
-            out["Classification"] = points.with_codes(codes)
-            points.tally("refused_points", refused)
-        out["ObjectID"] = ids.astype(np.uint64)
         if points.mask is not None:
-            out["ObjectID"] = np.where(points.mask, out["ObjectID"], points.arrays["ObjectID"])
-        return out
+            ids = np.where(points.mask, ids, points.arrays["ObjectID"])
+        return {"ObjectID": ids}

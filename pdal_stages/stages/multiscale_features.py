@@ -16,7 +16,6 @@ from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
 from ..features.registry import ALGORITHM_VERSION
-from ..features.voxels import LARGEST, check_side, represent
 from .base import Stage, StageContext
 from .options import Selection, ignore_option, option
 from .points import Points
@@ -56,21 +55,6 @@ class MultiscaleFeatures(Stage):
         "otherwise fitted to these points and written, so that other clouds can use the same ones",
     )
     ignore: Selection = ignore_option("Points left out, even as neighbors: they get no features")
-    copt_threshold: float | None = option(
-        "number",
-        None,
-        "Curvature from which on copt treats a point as scattered; default: by 2-means over the "
-        "points, or that of 'bins'",
-        *(0, 1),
-    )
-    voxel: float = option(
-        "number",
-        0.0,
-        "Voxel size, for very dense clouds: features are computed for one point per voxel, and "
-        "its other points get the same; 0 for none",
-        *(0, LARGEST),
-        unit="m",
-    )
     memory: int = option(
         *("integer", 512, "Memory for blocks of points, in addition to the cloud itself", 16),
         unit="MB",
@@ -88,8 +72,7 @@ class MultiscaleFeatures(Stage):
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
-        check_side(self.voxel)
-        plan, (bins, threshold) = self.plan, self._thresholds()
+        plan, (bins, threshold) = self.plan, _read_bins(self.bins)
         if self.bins and Path(self.bins).exists():
             if (plan.shapes and bins is None) or (plan.copt and threshold is None):
                 raise _not_thresholds(self.bins, "none of what these features need")
@@ -109,11 +92,6 @@ class MultiscaleFeatures(Stage):
                     cure="Use shorter neighborhood tokens",
                 )
 
-    def _thresholds(self) -> tuple[ShapeBins | None, float | None]:
-        """Return the thresholds of histograms and of curvature; None where points decide."""
-        bins, threshold = _read_bins(self.bins)
-        return bins, threshold if self.copt_threshold is None else self.copt_threshold
-
     def outputs(self) -> list[Output]:
         """Return the files that are written."""
         if self.bins is None or Path(self.bins).exists():
@@ -126,22 +104,18 @@ class MultiscaleFeatures(Stage):
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
-        return self.plan.halo_m + self.voxel
+        return self.plan.halo_m
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Compute features, block by block."""
         plan, names = self.plan, self.columns
-        bins, threshold = self._thresholds()
+        bins, threshold = _read_bins(self.bins)
         ignored = points.ignored(self.ignore)
         there = np.flatnonzero(~ignored)  # rows of the points that are seen
         xyz = points.xyz[there] if ignored.any() else points.xyz
         queries = None if points.mask is None else np.flatnonzero(points.mask[there])
         total = len(there) if queries is None else len(queries)
         inputs = {name: points.dimension(name)[there] for name in plan.dimensions}
-        representatives = represent(xyz, self.voxel, inputs.values(), queries)
-        if representatives is not None:
-            xyz, queries = xyz[representatives.rows], representatives.wanted
-            inputs = {name: values[representatives.rows] for name, values in inputs.items()}
         engine = FeatureEngine(
             xyz, plan, bins=bins, copt_threshold=threshold, seed=self.seed, threads=self.threads
         )
@@ -152,22 +126,16 @@ class MultiscaleFeatures(Stage):
         with Progress(total, self.type) as progress:
             run = engine.run(queries, dimensions=inputs, memory_mb=self.memory)
             for block in run.computed():
-                rows, values = block.rows, block.values
-                if representatives is not None:
-                    rows, place = representatives.members(rows)
-                    values = values[place]
-                progress.update(len(rows))
-                rows = there[rows]
+                progress.update(len(block.rows))
+                rows = there[block.rows]
                 for name, column in zip(names, columns, strict=True):
-                    out[name][rows] = values[:, column]
+                    out[name][rows] = block.values[:, column]
         for output in self.outputs() if len(engine) else ():
             _write_bins(output.path, engine.fit())
         figures = points.report.figures
         figures |= {"neighborhoods": len(plan.neighborhoods), "features": len(names)}
         if plan.copt:
             figures["copt_threshold"] = engine.copt_threshold
-        if representatives is not None:
-            figures["representatives"] = len(representatives.rows)
         figures |= engine.report.figures
         points.report.merge(engine.report)
         return out

@@ -37,7 +37,6 @@ _KINDS: dict[str, tuple[str | list[str], str]] = {
     "codes": _LISTED,
     "selection": _LISTED,
     "numbers": _LISTED,
-    "bands": _LISTED,
     "classes": (["object", "array", "string"], "a list of class codes, or a mapping of labels"),
     "mapping": (["object", "string"], 'a mapping such as {"2": "Ground"}'),
 }
@@ -111,7 +110,7 @@ class Option:
 
     #: A key of ``_KINDS``. ``list`` is a JSON list or comma-separated text; ``codes`` a list of
     #: class codes, or of ranges as PDAL writes them, ``Classification[7:7]``; ``selection`` the
-    #: same, of other dimensions too; ``bands`` two heights in meters, the lower one first.
+    #: same, of other dimensions too.
     kind: str
     #: The value where the option is absent; None means "decided by the stage".
     default: Any
@@ -227,19 +226,6 @@ class Option:
 
     def _parse_numbers(self, value: Any) -> list[float]:
         return [self._parse_number(item) for item in self._parse_list(value)]
-
-    def _parse_bands(self, value: Any) -> tuple[float, float] | None:
-        # Nothing grows to 1000 m: such a height is in another unit.
-        heights = self._parse_numbers(value)
-        if not heights:
-            return None
-        if len(heights) != 2 or not 0.0 < heights[0] < heights[1] < 1000.0:
-            raise OptionError(
-                f"option '{self.name}' must be two heights in meters, the lower one first",
-                found=", ".join(map(str, heights)),
-                cure="For example 0.5,2",
-            )
-        return heights[0], heights[1]
 
     def _parse_codes(self, value: Any) -> list[int]:
         chosen = self._parse_selection(value)

@@ -22,7 +22,6 @@ from ..classifier.input_dimensions import (
     DEFAULT_DIMENSIONS,
     optional_dimensions,
     required_dimensions,
-    take_dimensions,
 )
 from ..classifier.interface import kinds, trainer_of
 from ..classifier.model import Model, loaded_model
@@ -74,12 +73,6 @@ class TrainModel(Stage, settings=TrainingOptions):
         "where the points have them, Ground, HeightAboveOpening_5, HeightAboveOpening_17 and "
         "returns",
         may_be_empty=True,
-    )
-    survey: str = option(
-        "string",
-        "",
-        "Dimension that numbers the surveys: points of different surveys are not neighbors, and "
-        "surveys have equal weight",
     )
     checked_only: bool = option(
         "boolean",
@@ -189,14 +182,13 @@ class TrainModel(Stage, settings=TrainingOptions):
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
-        numbers = filter(None, (self.survey, self.groups))
+        numbers = [self.groups] if self.groups else []
         return [self.label, *numbers, *required_dimensions(self.training.inputs)]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Train on the points and write the model."""
         training = self.training_on(points)
-        clouds = [cloud for _, cloud in self.surveys(self.cloud_of(points, training))]
-        self.finish(train(clouds, training), points.report)
+        self.finish(train([self.cloud_of(points, training)], training), points.report)
         return {}
 
     @property
@@ -218,8 +210,6 @@ class TrainModel(Stage, settings=TrainingOptions):
         dimensions |= {
             n: points.arrays[n] for n in optional_dimensions(training.inputs) if n in points.arrays
         }
-        if self.survey:
-            dimensions[self.survey] = points.dimension(self.survey)
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
@@ -305,13 +295,3 @@ class TrainModel(Stage, settings=TrainingOptions):
             return points.mask
         choice.report_to(points.report)
         return choice.mask(part, points.xyz)
-
-    def surveys(self, cloud: TrainingCloud) -> list[tuple[float, TrainingCloud]]:
-        """Return a pair for each value of the dimension `survey`: the value, and its cloud."""
-        name = self.survey
-        if not name:
-            return [(0.0, cloud)]
-        column = take_dimensions((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
-        parts = {float(value): np.flatnonzero(column == value) for value in np.unique(column)}
-        clouds = {value: cloud.part(rows) for value, rows in parts.items()}
-        return [(v, replace(c, name=f"{name} {v:g}", survey="")) for v, c in clouds.items()]

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ..base.errors import DimensionError, OptionError, suggest
 
 _TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!]))",
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
+    r"|(?P<mark>&&|\|\||==|!=|<=|>=|[-+*/()<>!])|(?P<other>\S)",
     re.ASCII,
 )
 #: PDAL's operator -> Python's.
@@ -32,32 +32,22 @@ def _divide(a, b):
     return np.where(np.equal(b, 0), np.nan, np.divide(a, b))
 
 
-#: Operators on numbers, and on truth values.
-_OF_NUMBERS: dict[type, Callable] = {
-    ast.Eq: np.equal,
-    ast.NotEq: np.not_equal,
-    ast.Lt: np.less,
-    ast.LtE: np.less_equal,
-    ast.Gt: np.greater,
-    ast.GtE: np.greater_equal,
-    ast.Add: np.add,
-    ast.Sub: np.subtract,
-    ast.Mult: np.multiply,
-    ast.Div: _divide,
-    ast.USub: np.negative,
-}
-_OF_TRUTHS: dict[type, Callable] = {
-    ast.And: np.logical_and,
-    ast.Or: np.logical_or,
-    ast.Not: np.logical_not,
-}
-#: Other names that PDAL takes for dimensions, in small letters.
-_ALIASES = {
-    "class": "Classification",
-    "cls": "Classification",
-    "hag": "HeightAboveGround",
-    "nearinfrared": "Infrared",
-    "scanangle": "ScanAngleRank",
+#: Function of an operator, and whether it takes truth values.
+_OPERATORS: dict[type, tuple[Callable, bool]] = {
+    ast.Eq: (np.equal, False),
+    ast.NotEq: (np.not_equal, False),
+    ast.Lt: (np.less, False),
+    ast.LtE: (np.less_equal, False),
+    ast.Gt: (np.greater, False),
+    ast.GtE: (np.greater_equal, False),
+    ast.Add: (np.add, False),
+    ast.Sub: (np.subtract, False),
+    ast.Mult: (np.multiply, False),
+    ast.Div: (_divide, False),
+    ast.USub: (np.negative, False),
+    ast.And: (np.logical_and, True),
+    ast.Or: (np.logical_or, True),
+    ast.Not: (np.logical_not, True),
 }
 _Values = Mapping[str, NDArray]
 
@@ -68,44 +58,33 @@ class Expression:
     Raises
     ------
     OptionError
-        If it cannot be read; the message points at the place.
+        If it cannot be read.
     """
 
     def __init__(self, text: str) -> None:
         self.text = text
-        python = ""
-        # Where in the text the characters of the Python expression come from.
-        self._places: list[int] = []
-        position, end = 0, len(text.rstrip())
-        while position < end:
-            match = _TOKEN.match(text, position)
-            if match is None:
-                position += len(text[position:]) - len(text[position:].lstrip())
-                raise self._error(f"'{text[position]}' is not understood", position)
-            kind = str(match.lastgroup)
-            word = _IN_PYTHON.get(match[kind], match[kind])
-            if kind == "number":
-                word = repr(float(word)).replace("inf", "1e999")
-            elif kind == "name":
-                word = f"_{word}"  # some are words of Python
-            python += f"{word} "
-            self._places += [match.start(kind)] * (len(word) + 1)
-            position = match.end()
-        self._places.append(end)
+        python = " ".join(map(self._in_python, _TOKEN.finditer(text)))
         try:
             self._root = ast.parse(python, mode="eval").body
             names = (node.id[1:] for node in ast.walk(self._root) if isinstance(node, ast.Name))
             self._names = sorted(set(names))
             tried = self._evaluate(self._root, dict.fromkeys(self._names, np.zeros(0)))
-        except SyntaxError as error:
-            if "nested" in error.msg:
-                raise self._error("it is nested too deeply", 0) from None
-            place = self._places[(error.offset or 0) - 1]  # 0 says that the text ends too early
-            raise self._error("it is not a condition of this form", place) from None
+        except SyntaxError:
+            raise self._error("it is not a condition of this form") from None
         except (MemoryError, RecursionError):
-            raise self._error("it is nested too deeply", 0) from None
+            raise self._error("it is nested too deeply") from None
         if tried.dtype != bool:
-            raise self._error("it gives a number, not true or false", 0)
+            raise self._error("it gives a number, not true or false")
+
+    def _in_python(self, token: re.Match[str]) -> str:
+        """Return a number, name or operator as Python writes it."""
+        kind = str(token.lastgroup)
+        if kind == "other":
+            raise self._error(f"'{token[0]}' is not understood, at character {token.start() + 1}")
+        if kind == "number":
+            return repr(float(token[0])).replace("inf", "1e999")
+        # Some names are words of Python.
+        return f"_{token[0]}" if kind == "name" else _IN_PYTHON.get(token[0], token[0])
 
     def evaluate(self, arrays: _Values) -> NDArray[np.bool_]:
         """Return which points (n,) meet the condition.
@@ -119,9 +98,9 @@ class Expression:
         size = len(next(iter(arrays.values()))) if arrays else 0
         return np.broadcast_to(self._evaluate(self._root, values), (size,)).copy()
 
-    def _error(self, what: str, place: int) -> OptionError:
+    def _error(self, what: str) -> OptionError:
         return OptionError(
-            f"the 'where' expression cannot be read: {what}, at character {place + 1}",
+            f"the 'where' expression cannot be read: {what}",
             found=repr(self.text),
             cure='Example: "Classification == 2 && Z > 3"',
         )
@@ -135,7 +114,7 @@ class Expression:
                 return np.asarray(values[word[1:]], np.float64)
             case ast.BoolOp(op=op, values=nodes):
                 parts = nodes
-            case ast.UnaryOp(op=ast.Not() | ast.USub() as op, operand=part):
+            case ast.UnaryOp(op=op, operand=part):
                 parts = [part]
             case (
                 ast.BinOp(left=left, op=op, right=right)
@@ -143,28 +122,21 @@ class Expression:
             ):
                 parts = [left, right]
             case _:
-                raise self._error(
-                    "it is not a condition of this form", self._places[node.col_offset]
-                )
-        takes_truth = type(op) in _OF_TRUTHS
-        operands = [self._evaluate(part, values) for part in parts]
-        for part, value in zip(parts, operands, strict=True):
-            if (value.dtype == bool) != takes_truth:
-                needed = "a condition" if takes_truth else "a number"
-                raise self._error(f"{needed} is needed", self._places[part.col_offset])
-        function = (_OF_TRUTHS if takes_truth else _OF_NUMBERS)[type(op)]
+                raise self._error("it is not a condition of this form")
+        function, takes_truths = _OPERATORS.get(type(op), (None, False))
+        first, *others = [self._evaluate(part, values) for part in parts]
+        if function is None:
+            raise self._error("it is not a condition of this form")
+        if any((value.dtype == bool) != takes_truths for value in (first, *others)):
+            raise self._error(f"{'a condition' if takes_truths else 'a number'} is needed")
         with np.errstate(all="ignore"):
-            first, *others = operands
             return functools.reduce(function, others, first) if others else function(first)
 
 
 def _find(name: str, arrays: _Values) -> str:
-    """Return the dimension of a name: PDAL takes known ones in any case, and some aliases."""
-    if name in arrays:
-        return name
-    wanted = _ALIASES.get(name.lower(), name).lower()
-    for known in arrays:
-        if known.lower() == wanted:
+    """Return the dimension of a name, which PDAL takes in any case."""
+    for known in (name, *arrays):
+        if known.lower() == name.lower() and known in arrays:
             return known
     raise DimensionError(
         f"'where' names the dimension '{name}', which the points do not have",

@@ -63,10 +63,7 @@ class WriteObjects(ObjectOptions, Stage, settings=ObjectSettings):
         """Find objects and write them."""
         from ..reports.object_layers import write_objects
 
-        every = find_objects(self.cells(points, context), self.settings)
-        objects, refused = every.without(self.refuse)
-        if self.refuse:
-            points.report.figures["refused"] = refused
+        objects = find_objects(self.cells(points, context), self.settings)
         how = self.outlines == STRAIGHT, points.units, points.wkt
         points.report.figures |= with_vector(write_objects, self.filename, objects, *how)
         return {}

@@ -57,7 +57,6 @@ def objects_of_files(
     more = [Output(metadata, "metadata", JSON)] if metadata else []
     check_outputs([*stage.outputs(), *more], [*inputs, *names, *stage_files(stage)])
     objects, units, wkt = _find_in_files(inputs, stage, workers)
-    objects, refused = objects.without(stage.refuse)
     files = write_objects(stage.filename, objects, stage.outlines == STRAIGHT, units, wkt)["files"]
     summary = objects.summary()
     for kind, counts in summary.items():
@@ -65,8 +64,6 @@ def objects_of_files(
         print(f"{counts['objects']:,} {word}, {counts['to_be_checked']:,} to be checked")
         for reason, count in counts["reasons"].items():
             print(f"  {reason:28s} {count:>10,}")
-    if stage.refuse:
-        print(f"{refused:,} left out (refuse: {', '.join(stage.refuse)})")
     print("written to " + ", ".join(files))
     if metadata:
         about = {
@@ -75,7 +72,6 @@ def objects_of_files(
             "files": files,
             "settings": asdict(objects.settings),
             "objects": summary,
-            "refused": {"reasons": list(stage.refuse), "objects": refused},
         }
         write_json(metadata, about, "metadata")
     return {"files": files, **summary}

@@ -229,7 +229,7 @@ class TrainTask:
                 if task.survey:
                     yield replace(cloud, name=task.survey, survey=task.survey)
                 else:
-                    yield from (part for _, part in self.stage.surveys(cloud))
+                    yield cloud
 
         every = clouds()
         first = next(every)  # what is trained on follows from its dimensions
@@ -250,11 +250,11 @@ class TrainTask:
             for number, task in enumerate(self._each()):
                 subfolder = folder / f"survey{number}"
                 subfolder.mkdir()
-                survey_report, parts, names = task._in_tiles(subfolder, heights)
+                survey_report, cloud, names = task._in_tiles(subfolder, heights)
                 _check_same(names, dimensions or names)
                 dimensions = names
                 report.merge(survey_report)
-                clouds += parts
+                clouds.append(cloud)
             training = self.stage.training
             if self.stage.automatic:
                 training = replace(training, dimensions=tuple(dimensions or ()))
@@ -263,8 +263,8 @@ class TrainTask:
 
     def _in_tiles(
         self, folder: Path, heights: Sequence[Mapping[str, Any]]
-    ) -> tuple[Report, list[TiledCloud], list[str]]:
-        """Return a report, the points with heights as tiled clouds, and dimensions to train on."""
+    ) -> tuple[Report, TiledCloud, list[str]]:
+        """Return a report, the points with heights as a tiled cloud, and dimensions to train on."""
         tiles = folder / "tiles"
         tiles.mkdir()
         tail = {"type": "writers.null", "filename": str(tiles / "#.npz")}
@@ -285,7 +285,7 @@ class TrainTask:
         ignored = sum(job.record.get("ignored", 0) for job in run.tiles)
         report = Report({"points": run.summary["points"], "ignored": ignored}, list(run.messages))
         side = run.summary["tile"] * run.summary["meters_per_unit"]
-        clouds: dict[float, TiledCloud] = {}
+        tiled = TiledCloud(folder / "cloud", side)
         dimensions: list[str] | None = None
         looked = (job.record["looked"] for job in run.tiles if "looked" in job.record)
         choice = (
@@ -298,21 +298,17 @@ class TrainTask:
                 assert job.outputs is not None
                 _check_same(job.record["dimensions"], dimensions or job.record["dimensions"])
                 dimensions = job.record["dimensions"]
-                for value, cloud in self.stage.surveys(
-                    _read_back(job.outputs[0], self.stage.named, choice)
-                ):
-                    if value not in clouds:
-                        clouds[value] = TiledCloud(folder / f"cloud{len(clouds)}", side)
-                    if self.survey:
-                        cloud = replace(cloud, name=self.survey, survey=self.survey)
-                    clouds[value].put(job.tile, cloud)
+                cloud = _read_back(job.outputs[0], self.stage.named, choice)
+                if self.survey:
+                    cloud = replace(cloud, name=self.survey, survey=self.survey)
+                tiled.put(job.tile, cloud)
             for path in job.outputs or ():
                 Path(path).unlink(missing_ok=True)
         if dimensions is None:
             raise StageError(
                 "there are no points to train on", where=", ".join(self.files[:_NAMED])
             )
-        return report, [clouds[value] for value in sorted(clouds)], dimensions
+        return report, tiled, dimensions
 
 
 def _check_same(names: Sequence[str], before: Sequence[str]) -> None:

@@ -140,9 +140,9 @@ def test_training_on_odd_clouds(command, tmp_path, write_las):
         command.runs(words(ODD[case], {}, {}))
 
 
-def test_thresholds_and_surveys_of_no_points(command, tmp_path, write_las):
-    flight, bins = np.where(np.arange(300) < 9, np.nan, 1.0), tmp_path / "b.json"
-    path = written(tmp_path / "in.las", random(300), write_las, Flight=flight)
+def test_thresholds_of_no_points(command, tmp_path, write_las):
+    bins = tmp_path / "b.json"
+    path = written(tmp_path / "in.las", random(300), write_las)
     source = {"type": "readers.las", "filename": str(path), "use_eb_vlr": True}
     shapes = {
         "type": FEATURES["type"],
@@ -159,10 +159,6 @@ def test_thresholds_and_surveys_of_no_points(command, tmp_path, write_las):
     bins.write_text('{"bins": null, "copt_threshold": null}')
     command.refused(
         ["pipeline", job(tmp_path, source, shapes)], "does not hold the thresholds", "Delete it"
-    )
-    train = {**TRAIN, "filename": str(tmp_path / "model"), "survey": "Flight"}
-    command.refused(
-        ["pipeline", job(tmp_path, source, HAG, train)], "Flight is not finite", "9 points"
     )
 
 
