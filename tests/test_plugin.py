@@ -125,7 +125,7 @@ EVERY = [
     },
     {"type": "filters.wires", "code": 13},
     {"type": "filters.bridges", "code": 18},
-    {"type": "filters.objects", "refuse": ["low", "small"]},
+    {"type": "filters.objects", "building_height": 3},
     {"type": "filters.accuracy", "reference": "Classification", "print": False},
 ]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -73,7 +75,7 @@ def by_height(
     codes: NDArray[np.uint8],
     chosen: NDArray[np.bool_],
     height: NDArray,
-    limits: tuple[float, float],
+    limits: Sequence[float],
 ) -> None:
     """Reclassify the chosen points of high vegetation by height, in place.
 
