@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import ModelError
-from pdal_stages.stages.preprocessing import check, same
+from pdal_stages.stages.preprocessing import PDAL_OPTIONS, check, same
 from pdal_stages.stages.registry import stage_types
 
 HAG = {"type": "filters.hag_morphological"}
@@ -17,7 +17,9 @@ HAG = {"type": "filters.hag_morphological"}
 _PATHS = ("filename", "mapping", "string")
 
 
-CARRIED = {name: kind.in_models for name, kind in stage_types().items() if kind.in_models}
+CARRIED = {name: kind.in_models for name, kind in stage_types().items() if kind.in_models} | {
+    name: tuple(entry.name for entry in options) for name, options in PDAL_OPTIONS.items()
+}
 
 
 def test_no_option_that_holds_a_path_is_carried():
@@ -56,8 +58,12 @@ def test_one_spelling():
         ({"type": "filters.multiscalefeatures"}, "filters.multiscalefeatures"),
         ({"type": "filters.accuracy"}, "filters.accuracy"),
         ({"type": "filters.modelclassifier", "model": "x"}, "filters.modelclassifier"),
-        ({"type": "filters.smrf"}, "filters.smrf"),
-        ({**HAG, "ignore": "/etc/passwd"}, "'ignore'"),
+        ({"type": "filters.smrf", "dir": "/tmp"}, "'dir'"),
+        ({"type": "filters.smrf", "log": "/tmp/x"}, "'log'"),
+        ({"type": "filters.smrf", "where": "Z > 1"}, "'where'"),
+        ({"type": "filters.smrf", "ignore": "/etc/passwd"}, "'ignore'"),
+        ({"type": "filters.smrf", "cell": 1e-9}, "0.2 to 100"),
+        ({"type": "filters.hag_nn", "count": 1.5}, "whole number"),
         ({**HAG, "cell": 1e-9}, "0.05 to 1000"),
         ({**HAG, "cell": True}, "must be a number"),
         ({**HAG, "cell": 10**400}, "must be a number"),
@@ -94,7 +100,7 @@ _JSON = st.recursive(
     ),
     max_leaves=8,
 )
-_KINDS = [*stage_types(), "filters.python", "filters.stats", "filters.head"]
+_KINDS = [*stage_types(), *PDAL_OPTIONS, "filters.python", "filters.stats", "filters.head"]
 _NAMES = [
     *{name for names in CARRIED.values() for name in names},
     "log",

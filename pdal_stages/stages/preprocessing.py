@@ -1,10 +1,9 @@
 """Preprocessing of a model: the stages before the classifier that created what it reads.
 
 A model file holds them, `classify` runs them, and pipelines are compared with them. As a model file
-may come from anybody, only stages of ours and listed options are allowed
-(:attr:`Stage.in_models`): numbers within bounds, classes, conditions, never a path. Others are
-refused when a file is loaded, and training does not store them: it names PDAL's stages, which the
-user then puts before the classifier himself.
+may come from anybody, only listed stages and options are allowed (:attr:`Stage.in_models`,
+:data:`PDAL_OPTIONS`): numbers within bounds, classes, conditions, never a path. Others are refused
+when a file is loaded, and training does not store them.
 """
 
 from __future__ import annotations
@@ -35,6 +34,29 @@ GROUND_OF_PDAL = ("filters.smrf", "filters.pmf", "filters.csf")
 HEIGHTS_OF_PDAL = ("filters.hag_nn", "filters.hag_delaunay", "filters.hag_dem")
 #: PDAL's stages that measure from points of class 2; PDAL before 2.9 crashes where there are none.
 NEEDS_GROUND = ("filters.hag_nn", "filters.hag_delaunay")
+
+
+def _numbers(**bounds: tuple[float, float]) -> tuple[Option, ...]:
+    return tuple(Option("number", None, "", *ends, name=name) for name, ends in bounds.items())
+
+
+_WIDE = 0, 1000
+_OF_NEIGHBORS = (
+    Option("integer", None, "", 1, 1000, name="count"),
+    Option("boolean", None, "", name="allow_extrapolation"),
+)
+#: PDAL's stages that a model may carry, and their options. They read no file, move no point and
+#: leave none out; each writes `Classification` or `HeightAboveGround` alone. The bounds let all
+#: sensible values pass, but not grids and searches that would take a machine's memory or days.
+PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
+    "filters.smrf": (
+        *_numbers(cell=(0.2, 100), window=(1, 1000), cut=_WIDE),
+        *_numbers(scalar=_WIDE, slope=_WIDE, threshold=_WIDE),
+        Option("selection", None, "", name="ignore"),
+    ),
+    "filters.hag_nn": (*_OF_NEIGHBORS, *_numbers(max_distance=(0, 1e6))),
+    "filters.hag_delaunay": _OF_NEIGHBORS,
+}
 #: Options on a stage's place in a pipeline, on how it is run and on the units of the points at
 #: hand; they do not change what it computes.
 _NOT_STORED = (*PDAL_OWN, "threads", "horizontal_unit", "vertical_unit")
@@ -97,15 +119,19 @@ def _check_stage(stage: Mapping[str, Any]) -> dict[str, Any]:
     """Return a stage in one spelling, if a model may carry it."""
     kind = str(stage["type"])
     ours = stage_types().get(kind)
-    if ours is None or not ours.in_models:
+    allowed: Iterable[Option] = PDAL_OPTIONS.get(kind, ())
+    if ours is not None:
+        allowed = [option for option in ours.all_options() if option.name in ours.in_models]
+    options = {option.name: option for option in allowed}
+    if not options:
         raise ModelError(f"a model cannot carry the stage {kind[:80]!r}")
-    options = {each.name: each for each in ours.all_options() if each.name in ours.in_models}
     values = {name: value for name, value in stage.items() if name != "type"}
     if unknown := [name for name in values if name not in options]:
         raise ModelError(f"a model cannot carry option {unknown[0][:80]!r} of {kind}")
     try:
         values = {name: _value(options[name], value) for name, value in values.items()}
-        ours(values)
+        if ours is not None:
+            ours(values)
     except StageError as error:
         raise ModelError(f"a model cannot carry this {kind}", found=str(error)[:200]) from None
     return {"type": kind, **values}

@@ -242,3 +242,22 @@ def test_training_on_heights_that_a_model_cannot_carry(command, tmp_path, cloud)
     apply = {"type": "filters.modelclassifier", "model": str(target)}
     command.refused(["pipeline", job(tmp_path, cloud, apply, "out.las")], says)
     command.runs(["pipeline", job(tmp_path, cloud, *preparation, apply, out)])
+
+
+def test_heights_of_pdal_are_carried(command, tmp_path, cloud):
+    """filters.smrf and filters.hag_nn with options go into the file and are run by classify."""
+    smrf = {"type": "filters.smrf", "cell": "2", "ignore": "Classification[7:7]", "tag": "ground"}
+    nearest = {"type": "filters.hag_nn", "count": 2}
+    target = trained(
+        tmp_path / "m.model",
+        cloud,
+        KEEP,
+        smrf,
+        nearest,
+        label="Reference",
+        dimensions="HeightAboveGround",
+    )
+    carried = [{"type": "filters.smrf", "cell": 2, "ignore": ["Classification[7:7]"]}, nearest]
+    assert ps.load_model(target).info["preparation"] == carried
+    command.runs(["classify", cloud, tmp_path / "out.las", "--model", target])
+    assert np.unique(laspy.read(tmp_path / "out.las").classification).size == 2
