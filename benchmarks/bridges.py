@@ -2,8 +2,8 @@
 
 python benchmarks/bridges.py --data FOLDER
 
-Decks of scenes (tests/bridge_scenes.py; 8 points/m2), of the generated town and of the labeled
-clouds; wires of the town and of those clouds. Cars, lamps and what was never labeled count neither way. `false` is the share of all points that
+Decks of scenes (tests/bridge_scenes.py; 8 points/m2) and of the labeled clouds; wires of those clouds.
+Cars, lamps and what was never labeled count neither way. `false` is the share of all points that
 are wrongly taken; seconds are of one process.
 """
 
@@ -19,7 +19,6 @@ import numpy as np
 
 from pdal_stages.structures.decks import find_decks
 from pdal_stages.structures.wires import find_wires
-from pdal_stages.synthetic import make_town
 from pdal_stages.terrain.heights import filtered_ground
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -80,11 +79,6 @@ def main() -> None:
     for name, make in SCENES.items():
         xyz, codes = scan(make(), 8.0)
         decks(name, xyz, np.ones(len(xyz), bool), codes == 17, codes == 1)
-    for seed, density in ((1, 16.0), (2, 7.0)):
-        town = make_town(300.0, density, seed, progress=False)
-        true, use = town.classification, town.classification != 7
-        decks(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 17, true == 1)
-        wires(f"town {seed}, {density:g} points/m2", town.xyz, use, true == 14, true == 15)
     for name in CLOUDS:
         las = laspy.read(folder / name)
         codes = np.asarray(las.classification)

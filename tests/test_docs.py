@@ -159,7 +159,7 @@ made_town = functools.cache(ps.make_town)  # scripts of the gallery show the sam
     "script", sorted((ROOT / "docs" / "gallery").glob("[0-9]*.py")), ids=lambda p: p.stem
 )
 def test_gallery_scripts_run(script, tmp_path, monkeypatch):
-    monkeypatch.setenv("GALLERY_SIZE", "40")
+    monkeypatch.setenv("GALLERY_SIZE", "60")
     monkeypatch.setenv("GALLERY_OUTPUT", str(tmp_path))
     monkeypatch.syspath_prepend(str(script.parent))
     monkeypatch.delitem(sys.modules, "_common", raising=False)

@@ -31,7 +31,7 @@ def layer(path, name=None):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
-    town = ps.make_town(100.0, 6.0, seed=4, progress=False)
+    town = ps.make_town(100.0, 8.0, seed=4, progress=False)
     write_town(town, folder / "town.laz")
     las = laspy.read(folder / "town.laz")
     (folder / "parts").mkdir()

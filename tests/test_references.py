@@ -290,7 +290,7 @@ def test_outputs_of_tiles_keep_the_units_of_their_inputs(tmp_path, write_las):
 def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, write_las):
     """Feet across, meters up: by `objects`, `writers.objects`, and of what `classify --objects` writes."""
     pyogrio = pytest.importorskip("pyogrio")
-    town = ps.make_town(60.0, 6.0, seed=4, progress=False)
+    town = ps.make_town(60.0, 9.0, seed=4, progress=False)
     path = tmp_path / "town.las"
     write_town(town, path)
     las = laspy.read(path)

@@ -116,9 +116,8 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
     assert code == 0 and "east.laz" in output and "written to" in output
     figures = json.loads((tmp_path / "r.json").read_text())
     east, west = figures["tiles"]
-    assert (east["tile"], west["tile"]) == ("east.laz", "west.laz") and east["expected"] > 3 * west[
-        "expected"
-    ]
+    assert (east["tile"], west["tile"]) == ("east.laz", "west.laz")
+    assert east["expected"] > 2 * west["expected"]
     assert (
         figures["worst"][0]["tile"] == "east.laz"
         and "building, reliability 0.5" in figures["worst"][0]["reason"]

@@ -1,4 +1,4 @@
-"""Buildings, trees, wires and decks as objects: outlines along walls, crowns with their tops; to be
+"""Buildings, trees and wires as objects: outlines along walls, crowns with their tops; to be
 checked in yellow."""
 
 import numpy as np
@@ -10,7 +10,6 @@ import pdal_stages as ps
 
 #: Fill and edge of each layer, in the order they are drawn.
 INKS = {
-    "decks": ("#96c4cc", "#3c7882"),
     "crowns": ("#badba0", "#549448"),
     "buildings": ("#e28a78", "#8c281e"),
     "spans": ("#966e00", "#966e00"),

@@ -190,7 +190,7 @@ def _plugin(options: argparse.Namespace) -> int:
 
 
 def _warmup(options: argparse.Namespace) -> None:
-    """Run the kernels of the demo, heights, training, classification and objects once."""
+    """Run the kernels of heights, training, classification and objects once."""
     import numpy as np
 
     from ..classifier.training import train
@@ -200,10 +200,8 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..objects.roofs import roof_planes
     from ..structures.decks import find_decks
     from ..structures.wires import find_wires
-    from ..synthetic import make_town
     from ..terrain import detached_noise, filtered_ground, hag_minima
 
-    make_town(20.0, 1.0, threads=1, progress=False)
     # A deck over a valley, with land at both ends, so that the kernels for decks run as well.
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-120.0, 120.0), np.arange(-80.0, 80.0)))
     z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))

@@ -1,52 +1,57 @@
-"""Generate a town under a simulated flight: options, flight, points, a LAS or LAZ file."""
+"""Scan the generated town from simulated flight strips: options, returns, a LAS or LAZ file."""
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
+import itertools
 import math
 import os
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base import checks
-from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION
+from ..base.asprs import GROUND, HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION
 from ..base.files import whole_files
 from ..base.progress import Progress
 from ..base.threads import map_blocks
-from .districts import VEGETATION, fill
-from .ray_casting import build_scene, cast
-from .townplan import block_at, heights, plan_town
+from .blocks import HIGHEST, PITCH, VEGETATION, Solid, TownBlock, cover, ground
 
 # A town's points depend on these: another value gives another town for the same seed.
-#: Of the aircraft above the quays, meters; above all solids.
-ALTITUDE = 350.0
+#: Of the aircraft above the middle of the heights, meters.
+ALTITUDE = 200.0
+#: From the line below a strip to the next one, meters.
+STRIP_SPACING = 130.0
+#: From the line below a strip to the strip's edges, meters.
+SWATH_HALF = 93.0
 #: Of the aircraft, meters a second.
 SPEED = 60.0
-#: Half the opening of the scanner, degrees.
-SCAN_ANGLE = 25.0
-#: Share of a swath that the next one covers as well.
-OVERLAP = 0.3
-#: From the end of a strip to the start of the next, seconds.
-TURN = 240.0
+#: From the start of a strip to the start of the next, seconds.
+STRIP_SECONDS = 1000.0
 #: Adjusted standard GPS time of the first pulse: April 2020.
 GPS_START = 270_000_000.0
-#: Flown beyond the square, meters: what stands outside throws shadows into it.
+#: Flown beyond the square, meters: beams of these pulses reach into it.
 BESIDE = 25.0
-#: Pulses cast at a time, about.
-PULSES_PER_CHUNK = 60_000
-#: Pulses of the trial that shows how many returns a pulse gives.
-SAMPLE = 20_000
-#: Farthest that a beam travels sideways from the highest solid to the lowest ground, meters: at
-#: `SCAN_ANGLE` that is enough for 96 m between them. A wider angle or higher solids need more.
-SIDEWAYS = 45.0
-#: Side of the square over which the trial flies at most, meters.
-TRIAL_SIZE = 400.0
-#: Blocks that are kept for later scan lines; not tuned.
-CACHED_BLOCKS = 1500
-#: Intensity of a perfect reflector that faces the sensor at `ALTITUDE`.
+#: Pulses on a side of the trial that shows how many returns a pulse gives.
+TRIAL = 100
+#: From town coordinates (u, v) to meters east and north: edges of tiles are no walls.
+TURN = np.array([[math.cos(0.15), -math.sin(0.15)], [math.sin(0.15), math.cos(0.15)]])
+#: Returns closer than that are one, meters: half the length of a pulse of 4 ns.
+SEPARATION = 0.6
+#: Most returns of a pulse.
+MAX_RETURNS = 5
+#: Share of pulses that end at a leaf or a wire that they meet.
+ENDING = 0.35
+#: Half the width of a beam, meters: as near it meets a wire.
+BEAM_HALF = 0.12
+#: Sag of a wire in its middle, as a share of its length.
+SAG = 0.02
+#: Steepest beam, meters across a meter of height.
+STEEPEST = SWATH_HALF / ALTITUDE
+#: Intensity of a perfect reflector.
 FULL_INTENSITY = 4000.0
 #: Standard deviation of the logarithm of intensities; not measured.
 SPECKLE = 0.12
@@ -55,8 +60,6 @@ LOW_HEIGHT = 0.5
 MEDIUM_HEIGHT = 2.0
 #: Scan angles in a LAS file are whole numbers of this, degrees (LAS 1.4, point formats 6 to 10).
 SCAN_ANGLE_STEP = 0.006
-#: Farthest that a solid reaches out of its block, meters: wires to the next one.
-SPAN = 65.0
 
 #: Corner of a town, meters: x and y of the low corner, height of the quays.
 ORIGIN = np.array([500_000.0, 5_400_000.0, 60.0])
@@ -98,135 +101,203 @@ class Town:
 
     def ground_height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the true height of the bare ground at places (n,), in the system of ``xyz``."""
-        plan = plan_town(self.seed)
-        local = np.column_stack([x, y]) - ORIGIN[:2] - self.size / 2
-        return heights(local @ plan.turn, plan) + ORIGIN[2]
+        uv = (np.column_stack([x, y]) - ORIGIN[:2]) @ TURN
+        return ground(uv, self.seed) + ORIGIN[2]
 
 
-class Flight:
-    """Pulses over a square of `size` meters, `spacing` meters apart below the sensor."""
+@dataclasses.dataclass
+class Pulses:
+    """Pulses that are aimed at one block; a beam is at ``place + z * drift`` at height z."""
 
-    def __init__(self, seed: int, size: float, spacing: float) -> None:
-        self.size, self.spacing = size, spacing
-        rng, half = np.random.default_rng([seed, 0xF117]), math.radians(SCAN_ANGLE)
-        self.heading = math.radians(rng.uniform(70, 110))  # from east
-        swath = 2.0 * ALTITUDE * math.tan(half)
-        diagonal = abs(math.cos(self.heading)) + abs(math.sin(self.heading))
-        self.reach = 0.5 * size * diagonal + BESIDE
-        distance = swath * (1.0 - OVERLAP)
-        # At least two strips, so that every town is seen from two sides.
-        self.strips = max(2, math.ceil((2 * self.reach - swath * OVERLAP) / distance))
-        self.across = (np.arange(self.strips) - 0.5 * (self.strips - 1)) * distance
-        self.lines = math.ceil(2 * self.reach / spacing)
-        self.per_line = math.ceil(2 * half * ALTITUDE / spacing)
-        # A turning polygon: every line runs from right to left.
-        self.angles = half - (np.arange(self.per_line) + 0.5) * (2 * half / self.per_line)
+    place: NDArray[np.float64]  #: (n, 2) town coordinates at height 0
+    drift: NDArray[np.float64]  #: (n, 2) meters across a meter of height
+    time: NDArray[np.float64]  #: (n,) GPS time, seconds
+    strip: NDArray[np.uint16]  #: (n,) from 1
+    angle: NDArray[np.float64]  #: (n,) degrees
 
-    def parts(self, pulses: int) -> list[tuple[int, int, int]]:
-        """Return parts of about `pulses` pulses by time: strip, first line, end of lines."""
-        step = max(1, int(pulses / min(self.per_line, 2 * self.reach / self.spacing)))
-        firsts = range(0, self.lines, step)
-        return [
-            (strip, n, min(n + step, self.lines)) for strip in range(self.strips) for n in firsts
-        ]
+    def at(self, rows: NDArray, z: NDArray | float) -> NDArray[np.float64]:
+        """Return the places (m, 2) of some beams at heights (m,)."""
+        return self.place[rows] + self.drift[rows] * np.reshape(z, (-1, 1))
 
-    def aimed(self, part: int) -> int:
-        """Count the pulses that would meet level ground inside the square, `part` at a time."""
-        return sum(
-            (np.abs(self.pulses(*p)[2]) < self.size / 2).all(axis=1).sum() for p in self.parts(part)
+
+def pulses_at(i: int, j: int, size: float, spacing: float) -> Pulses:
+    """Return the pulses of all strips that are aimed at a block, `spacing` meters apart."""
+    corners = PITCH * np.array([(i + p, j + q) for p in (0, 1) for q in (0, 1)]) @ TURN.T
+    low, high = np.maximum(corners.min(0), -BESIDE), np.minimum(corners.max(0), size + BESIDE)
+    parts = []
+    for strip in range(math.ceil((size + 2 * BESIDE) / STRIP_SPACING)):
+        middle = STRIP_SPACING * (strip + 0.3)
+        west, east = max(low[0], middle - SWATH_HALF), min(high[0], middle + SWATH_HALF)
+        column, line = (
+            np.arange(math.ceil(a / spacing), max(math.ceil(b / spacing), math.ceil(a / spacing)))
+            for a, b in ((west, east), (low[1], high[1]))
         )
+        column, line = (axis.ravel() for axis in np.meshgrid(column, line))
+        mixed = column * 12.9898 + line * 78.233 + strip  # a pulse has one place in all blocks
+        odd = np.sin(np.column_stack([mixed, mixed + 1.0])) * 43758.5453 % 1.0 - 0.5
+        xy = (np.column_stack([column, line]) + 0.6 * odd) * spacing
+        drift = np.column_stack([(middle - xy[:, 0]) / ALTITUDE, np.zeros(len(xy))])
+        across = (column * spacing - middle + STRIP_SPACING) / (2 * STRIP_SPACING)  # 0 to 1
+        time = GPS_START + strip * STRIP_SECONDS + (line + across) * spacing / SPEED
+        angle = np.degrees(np.arctan2(xy[:, 0] - middle, ALTITUDE))
+        number = np.full(len(xy), strip + 1, np.uint16)
+        parts.append((xy @ TURN, drift @ TURN, time, number, angle))
+    columns = Pulses(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    inside = (np.floor(columns.place / PITCH) == (i, j)).all(axis=1)
+    return Pulses(*(getattr(columns, f.name)[inside] for f in dataclasses.fields(columns)))
 
-    def pulses(self, strip: int, first: int, last: int) -> list[np.ndarray]:
-        """Return the pulses of scan lines of a strip that come near the square, in order of time.
 
-        Returns
-        -------
-        origin : (n, 3)
-            Meters from the middle of the square at the height of the quays.
-        direction : (n, 3)
-            Unit vectors.
-        level : (n, 2)
-            Places where the beams would meet level ground.
-        time : (n,)
-            GPS time, seconds.
-        angle : (n,)
-            Scan angle, degrees, positive to the right of the flight.
-        """
-        forward = 1.0 - 2.0 * (strip % 2)
-        left = self.across[strip] - forward * ALTITUDE * np.tan(self.angles)
-        step = np.flatnonzero(np.abs(left) < self.reach + 5.0)
-        line, step = np.repeat(np.arange(first, last), step.size), np.tile(step, last - first)
-        angle, when = self.angles[step], (line + step / self.per_line) * (self.spacing / SPEED)
-        # The aircraft drifts a little to the side, and its nose goes up and down.
-        along = forward * (when * SPEED - self.reach) + 1.4 * np.sin(0.7 * when + 2.0 * strip)
-        side = self.across[strip] + 1.5 * np.sin(0.23 * when + strip)
-        c, s, out = math.cos(self.heading), math.sin(self.heading), -forward * np.sin(angle)
-        origin = np.column_stack([along * c - side * s, along * s + side * c, 0 * along + ALTITUDE])
-        direction = np.column_stack([-out * s, out * c, -np.cos(angle)])
-        level = origin[:, :2] - ALTITUDE / direction[:, 2:] * direction[:, :2]
-        near = (np.abs(level) < self.size / 2 + BESIDE).all(axis=1)
-        time = GPS_START + strip * (2 * self.reach / SPEED + TURN) + when
-        return [column[near] for column in (origin, direction, level, time, np.degrees(angle))]
+def crossing(solid: Solid, pulses: Pulses, rows: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the heights at which some beams enter and leave a solid; it is missed if not above."""
+    drift, away = pulses.drift[rows], pulses.place[rows] - solid.middle
+    if solid.shape == "wire":
+        length, enter = 2 * solid.half[0], np.full(len(rows), solid.low)
+        for _ in range(3):  # the beam's place follows from the height, and the height from it
+            along = (away[:, 0] + enter * drift[:, 0]) / length + 0.5
+            sag = 4 * SAG * length * along * (1 - along)
+            enter = solid.low + along * (solid.high - solid.low) - sag
+        hit = (along > 0) & (along < 1) & (abs(away[:, 1] + enter * drift[:, 1]) < BEAM_HALF)
+        return enter, np.where(hit, enter - 0.1, np.inf)
+    if solid.shape == "ball":  # |place| = 1, where the ball has the radius 1
+        half = np.array([*solid.half, 0.5 * (solid.high - solid.low)])
+        start = np.column_stack([away, np.full(len(rows), -0.5 * (solid.low + solid.high))]) / half
+        step = np.column_stack([drift, np.ones(len(rows))]) / half
+        a, b, c = (step**2).sum(1), (start * step).sum(1), (start**2).sum(1) - 1.0
+        root = b * b - a * c
+        missed = root <= 0
+        root = np.sqrt(np.maximum(root, 0.0))
+        return (root - b) / a, np.where(missed, np.inf, (-root - b) / a)
+    enter, leave = np.full(len(rows), solid.high), np.full(len(rows), solid.low)
+    for axis in (0, 1):
+        slope = np.where(abs(drift[:, axis]) < 1e-9, 1e-9, drift[:, axis])
+        ends = [(side * solid.half[axis] - away[:, axis]) / slope for side in (-1, 1)]
+        enter, leave = np.minimum(enter, np.maximum(*ends)), np.maximum(leave, np.minimum(*ends))
+        for pitch in (solid.pitch[axis], -solid.pitch[axis]) if solid.pitch[axis] else ():
+            roof = (solid.peak[axis] - pitch * away[:, axis]) / (1 + pitch * drift[:, axis])
+            enter = np.minimum(enter, roof)
+    return enter, leave
+
+
+@dataclasses.dataclass
+class Returns:
+    """Returns of pulses, in order of the pulse and from the top down."""
+
+    pulse: NDArray[np.int64]  #: (n,) row of the pulse
+    z: NDArray[np.float64]  #: (n,)
+    code: NDArray[np.int64]  #: (n,) class, or VEGETATION
+    reflectance: NDArray[np.float64]  #: (n,)
+    passes: NDArray[np.bool_]  #: (n,) whether a part of the beam goes on
+
+    def only(self, kept: NDArray) -> Returns:
+        """Return some of the returns, by a mask or in an order."""
+        return Returns(*(getattr(self, f.name)[kept] for f in dataclasses.fields(self)))
+
+    def earlier(self, counted: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Count, for each return, the earlier ones of its pulse for which a mask holds."""
+        total: NDArray[np.int64] = np.cumsum(counted) - counted
+        return total - total[np.searchsorted(self.pulse, self.pulse)]
+
+
+def cast(pulses: Pulses, solids: list[Solid], seed: int, rng: np.random.Generator) -> Returns:
+    """Return the returns of pulses from the ground and solids."""
+    every = np.arange(len(pulses.place))
+    z = np.zeros(len(every))
+    for _ in range(6):  # slopes are gentle, so steps converge
+        z = ground(pulses.at(every, z), seed)
+    reflectance, grass = cover(pulses.at(every, z))
+    grass *= rng.random(len(every))
+    grass[grass < 0.08] = 0.0
+    code = np.where(grass > 0, VEGETATION, GROUND)
+    met = [(every, z + grass, code, reflectance, np.zeros(len(every), bool))]
+    level = float(np.mean(z)) if len(z) else 0.0
+    places = pulses.at(every, level)
+    order = np.argsort(places[:, 0])
+    u, v = places[order].T
+    for solid in solids:
+        reach = STEEPEST * max(abs(solid.low - level), abs(solid.high - level)) + 1.0
+        (west, south), (east, north) = np.array(solid.middle) + np.outer((-1, 1), solid.half)
+        first, last = np.searchsorted(u, (west - reach, east + reach))
+        beside = (v[first:last] > south - reach) & (v[first:last] < north + reach)
+        near = order[first:last][beside]
+        if not len(near):
+            continue
+        enter, leave = crossing(solid, pulses, near)
+        hit = enter > leave
+        if solid.extinction:  # Beer and Lambert
+            enter = enter - rng.exponential(1 / solid.extinction, len(near))
+            hit &= enter > leave
+        passes = solid.extinction > 0 or solid.shape == "wire"
+        rest = (np.full(hit.sum(), value) for value in (solid.code, solid.reflectance, passes))
+        met.append((near[hit], enter[hit], *rest))
+    returns = Returns(*(np.concatenate(column) for column in zip(*met, strict=True)))
+    returns = returns.only(np.lexsort((-returns.z, returns.pulse)))
+    ends = ~returns.passes | (rng.random(len(returns.z)) < ENDING)
+    returns = returns.only(returns.earlier(ends) == 0)
+    same = np.diff(returns.pulse, prepend=-1) == 0
+    same &= np.diff(returns.z, prepend=np.inf) > -SEPARATION
+    returns = returns.only(~same)
+    return returns.only(returns.earlier(np.full(len(returns.z), True)) < MAX_RETURNS)
 
 
 class FlownTown:
-    """Plan, solids and flight of a town, ready to be cast part by part."""
+    """Blocks and flight of a town, ready to be scanned block by block."""
 
-    def __init__(self, size: float, density: float, seed: int, noise: float) -> None:
-        self.seed, self.noise, self.plan = seed, noise, plan_town(seed)
-        # Blocks are made when first needed; the latest ones are kept.
-        self.block = lru_cache(CACHED_BLOCKS)(lambda i, j: fill(self.plan, i, j))
-        # The returns of a coarse flight over the middle of the town give the spacing.
-        sizes = min(size, TRIAL_SIZE), size
-        trial, coarse = (Flight(seed, side, side / math.sqrt(SAMPLE)) for side in sizes)
-        returns = sum(len(self.town(trial, *part)) for part in trial.parts(SAMPLE))
-        coarse_density = max(returns, 1) / trial.aimed(SAMPLE) * coarse.aimed(SAMPLE) / size**2
-        self.flight = Flight(seed, size, coarse.spacing * math.sqrt(coarse_density / density))
-
-    def town(self, flight: Flight, strip: int, first: int, last: int) -> Town:
-        """Return the points of some scan lines of a strip."""
-        turn, plan = self.plan.turn, self.plan
-        rng = np.random.default_rng([self.seed, strip, first, last])
-        origin, direction, level, time, angle = flight.pulses(strip, first, last)
-        origin, direction = (
-            np.column_stack([a[:, :2] @ turn, a[:, 2]]) for a in (origin, direction)
+    def __init__(self, size: float, seed: int, noise: float) -> None:
+        self.size, self.seed, self.noise = size, seed, noise
+        corners = np.array([(x, y) for x in (0, size) for y in (0, size)], float) @ TURN
+        (i0, j0), (i1, j1) = (
+            np.floor(edge / PITCH).astype(int).tolist()
+            for edge in (corners.min(0) - BESIDE, corners.max(0) + BESIDE)
         )
-        hits = np.zeros((0, 7))
-        if len(origin):
-            low, high = (level @ turn).min(axis=0) - SIDEWAYS, (level @ turn).max(axis=0) + SIDEWAYS
-            (i0, j0, _), (i1, j1, _) = block_at(*(low - SPAN), plan), block_at(*(high + SPAN), plan)
-            sites = [self.block(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
-            hits = cast(origin, direction, build_scene(sites, low, high), plan, rng)
-        pulse = hits[:, 6].astype(np.int64)
+        self.aimed = list(itertools.product(range(i0, i1 + 1), range(j0, j1 + 1)))
+        self.block = functools.lru_cache(1500)(lambda i, j: TownBlock(seed, i, j).solids)
+
+    def solids(self, i: int, j: int) -> list[Solid]:
+        """Return the solids that beams at a block may meet."""
+        edge = STEEPEST * HIGHEST
+        low, high = np.array([i, j]) * PITCH - edge, np.array([i + 1, j + 1]) * PITCH + edge
+        near = itertools.product((i - 1, i, i + 1), (j - 1, j, j + 1))
+        listed = itertools.chain.from_iterable(self.block(*each) for each in near)
+        return [
+            s
+            for s in listed
+            if ((np.array(s.middle) + s.half > low) & (np.array(s.middle) - s.half < high)).all()
+        ]
+
+    def scan(self, i: int, j: int, spacing: float) -> Town:
+        """Return the points of the pulses that are aimed at a block."""
+        rng = np.random.default_rng([self.seed, i + 2**20, j + 2**20, 1])
+        pulses = pulses_at(i, j, self.size, spacing)
+        returns = cast(pulses, self.solids(i, j), self.seed, rng)
+        xyz = np.column_stack([pulses.at(returns.pulse, returns.z) @ TURN.T, returns.z])
         # One error per pulse, mostly in height, so that its returns stay in order.
-        xyz = (
-            hits[:, 1:4] + self.noise * (rng.standard_normal(origin.shape) * (0.5, 0.5, 1.0))[pulse]
-        )
-        xyz[:, :2] = xyz[:, :2] @ turn.T + flight.size / 2
-        mm = np.round(xyz * 1000.0)  # so that a file holds exactly these
-        outside = (mm[:, :2] < 0).any(axis=1) | (mm[:, :2] >= 1000.0 * flight.size).any(axis=1)
-        keep = ~np.isin(pulse, pulse[outside])  # a pulse has all its returns or none
-        mm, pulse, distance, (code, echo) = mm[keep], pulse[keep], hits[keep, 0], hits[keep, 4:6].T
-        above = mm[:, 2] / 1000.0 - heights((mm[:, :2] / 1000.0 - flight.size / 2) @ turn, plan)
+        error = rng.standard_normal((len(pulses.place), 3)) * (0.5, 0.5, 1.0)
+        mm = np.round((xyz + self.noise * error[returns.pulse]) * 1000.0)  # as a file holds them
+        outside = (mm[:, :2] < 0).any(axis=1) | (mm[:, :2] >= 1000.0 * self.size).any(axis=1)
+        keep = ~np.isin(
+            returns.pulse, returns.pulse[outside]
+        )  # a pulse has all its returns or none
+        returns, mm = returns.only(keep), mm[keep]
+        above = mm[:, 2] / 1000.0 - ground(mm[:, :2] / 1000.0 @ TURN, self.seed)
         lower = [above < LOW_HEIGHT, above < MEDIUM_HEIGHT]
         plants = np.select(lower, [LOW_VEGETATION, MEDIUM_VEGETATION], HIGH_VEGETATION)
-        code = np.where(code == VEGETATION, plants, code)
-        speckle = np.exp(SPECKLE * rng.standard_normal(len(echo)))
-        echo = FULL_INTENSITY * echo * (ALTITUDE / distance) ** 2 * speckle
-        _, start, nth, count = np.unique(
-            pulse, return_index=True, return_inverse=True, return_counts=True
-        )
+        number = returns.earlier(np.full(len(above), True)) + 1
+        count = np.bincount(returns.pulse, minlength=len(pulses.place))[returns.pulse]
+        echo = FULL_INTENSITY * returns.reflectance / count
+        echo *= np.exp(SPECKLE * rng.standard_normal(len(echo)))
         return Town(
             xyz=(mm + ORIGIN * 1000.0) / 1000.0,
-            classification=code.astype(np.uint8),
+            classification=np.where(returns.code == VEGETATION, plants, returns.code).astype(
+                np.uint8
+            ),
             intensity=np.clip(echo, 1, 65535).astype(np.uint16),
-            return_number=(np.arange(len(pulse)) - start[nth] + 1).astype(np.uint8),
-            number_of_returns=count[nth].astype(np.uint8),
-            gps_time=time[pulse],
-            point_source_id=np.full(len(pulse), strip + 1, dtype=np.uint16),
-            scan_angle=angle[pulse].astype(np.float32),
+            return_number=number.astype(np.uint8),
+            number_of_returns=count.astype(np.uint8),
+            gps_time=pulses.time[returns.pulse],
+            point_source_id=pulses.strip[returns.pulse],
+            scan_angle=pulses.angle[returns.pulse].astype(np.float32),
             height_above_ground=above.astype(np.float32),
-            size=flight.size,
+            size=self.size,
             seed=self.seed,
         )
 
@@ -240,11 +311,11 @@ def make_town(
     threads: int | None = None,
     progress: bool | None = True,
 ) -> Town:
-    """Return a generated town under a simulated flight, with true classes and heights.
+    """Return a generated town, scanned from flight strips, with true classes and heights.
 
-    Pulses are cast as five sub-beams each through the solids of the town, so shadows, facades, roof
-    edges with two returns and ground below trees come out as they do in a scan. The same options
-    give the same points, whatever the number of threads.
+    Beams are slanted, so there are facades and shadows; leaves and wires let a part of them
+    through, so pulses have up to five returns. The same options give the same points, whatever the
+    number of threads.
 
     Parameters
     ----------
@@ -264,15 +335,25 @@ def make_town(
     density = checks.number("'density'", density, 0.05, 500, unit="points/m2")
     seed = checks.whole("'seed'", seed, 0, 2**31 - 1)
     noise = checks.number("'noise'", noise, 0, 0.5, unit="m")
-    flown, pieces = FlownTown(size, density, seed, noise), []
-    with Progress(int(density * size**2), "synthetic", enabled=progress) as line:
-        parts = flown.flight.parts(PULSES_PER_CHUNK)
-        for piece in map_blocks(lambda part: flown.town(flown.flight, *part), parts, threads):
-            line.update(len(piece))
-            pieces.append(piece)
+    flown = FlownTown(size, seed, noise)
+
+    def scan(spacing: float, shown: bool | None) -> list[Town]:
+        pieces = []
+        with Progress(len(flown.aimed), "synthetic", enabled=shown) as line:
+            for piece in map_blocks(
+                lambda at: flown.scan(at[0], at[1], spacing), flown.aimed, threads
+            ):
+                line.update(1)
+                pieces.append(piece)
+        return pieces
+
+    trial = size / TRIAL
+    count = sum(len(piece) for piece in scan(trial, False))
+    pieces = scan(trial * math.sqrt(count / size**2 / density), progress)
     names = [f.name for f in dataclasses.fields(Town) if f.name not in ("size", "seed")]
     columns = {name: np.concatenate([getattr(each, name) for each in pieces]) for name in names}
-    return Town(**columns, size=size, seed=seed)
+    order = np.argsort(columns["gps_time"], kind="stable")
+    return Town(**{name: column[order] for name, column in columns.items()}, size=size, seed=seed)
 
 
 def write_town(town: Town, path: str | os.PathLike) -> None:
