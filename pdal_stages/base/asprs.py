@@ -43,7 +43,6 @@ MEDIUM_VEGETATION = 4
 HIGH_VEGETATION = 5
 BUILDING = 6
 WIRE = 14  #: conductors
-TOWER = 15  #: transmission towers
 BRIDGE = 17  #: bridge decks
 #: Codes that say nothing about the object: never classified, unclassified.
 UNLABELED = (0, 1)
