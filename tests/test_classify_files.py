@@ -95,18 +95,6 @@ def test_what_is_refused_leaves_no_folder(folder, classify, tmp_path, words, how
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("given", ["in/t[01].laz", "in/t0.laz"])
-def test_files_that_are_in_the_output_folder_are_told(folder, classify, tmp_path, given):
-    """Which of them are replaced, and which stay that this run did not write."""
-    code, _, err = classify(folder / given, f"{tmp_path}/out")
-    assert code == 0 and "replaced" not in err and "not written by this run" not in err
-    (tmp_path / "out/older.laz").write_bytes((folder / "in/t2.laz").read_bytes())
-    code, _, err = classify(folder / given, f"{tmp_path}/out")
-    assert code == 0 and "replaced: t0.laz" in err
-    assert "1 LAS or LAZ file in the folder of the outputs not written by this run" in err
-    assert "older.laz" in err and (tmp_path / "out/older.laz").exists()
-
-
 def test_a_file_where_the_folder_should_be(folder, classify, tmp_path):
     (tmp_path / "a").write_text("a file")
     for output in ("a/b", "a/"):

@@ -141,7 +141,7 @@ def test_forms_follow_the_command(capsys):
         "name": "noise", "flag": "--noise", "off": "--no-noise", "kind": "boolean", "help": "", "default": True,
         "choices": [], "required": False, "many": False, "value": "",
     }  # fmt: skip
-    assert arguments["per"]["choices"] == ["auto", "file", "tile"]
+    assert arguments["per"]["choices"] == ["file", "tile"]
     assert "1/32 (3 cm" in arguments["dimensions"]["help"]
     options = {
         argument["name"]: argument

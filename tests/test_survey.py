@@ -239,7 +239,7 @@ def test_the_side_of_tiles_keeps_to_the_memory(density, memory, halo):
     result = Density.measure(extents)
     options = TilingOptions(memory=int(memory), workers=None)
     try:
-        chosen, _ = choose_tiles(options, result, halo, True)
+        chosen, _ = choose_tiles(options, result, halo)
     except OptionError:
         least = worker_bytes(result.read_by(1.0, halo), result.largest) + PARENT
         assert least > memory  # nothing would have fitted

@@ -19,7 +19,7 @@ from pdal_stages.pipeline.inputs_outputs import locations
 from pdal_stages.synthetic.town import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.inputs import CloudIndex, InputSource, find_sources, one_format
+from pdal_stages.tiling.inputs import CloudIndex, InputSource
 from pdal_stages.tiling.sorted_points import cut_all, sort_points
 from pdal_stages.tiling.tile_grid import TileGrid
 from pdal_stages.tiling.tiled_run import TilingOptions, run_tiled
@@ -84,9 +84,7 @@ def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix,
     assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
     fine = sort_points(str(path), TileGrid(0.1), str(tmp_path / "fine"))
     assert len(fine["tiles"]) > 0.5 * len(xyz)  # small tiles are no sign of damage
-    (piece,) = cut_all(
-        grid, (1, 2), [(InputSource(str(path), {}, "las"), index)], 3.0, str(tmp_path)
-    )
+    (piece,) = cut_all(grid, (1, 2), [InputSource(str(path), {}, index=index)], 3.0, str(tmp_path))
     las, all_ = laspy.read(piece.path), laspy.read(path)
     expected = np.flatnonzero(
         (xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78)
@@ -445,10 +443,10 @@ def test_outputs_need_names(tmp_path, town_file):
             30,
         )
     with pytest.raises(PipelineError, match="no file matches"):
-        find_sources([{"type": "readers.las", "filename": str(tmp_path / "none*.las")}])
+        run_tiled([str(tmp_path / "none*.las"), str(tmp_path / "o_#.las")], 30)
 
 
-# ---- tile indexes and EPT --------------------------------------------------------------------------------
+# ---- tile indexes --------------------------------------------------------------------------------
 
 
 def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, whole):
@@ -470,47 +468,6 @@ def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, wh
     pipeline[0] = {"type": "readers.tindex", "filename": str(tmp_path / "b.gpkg")}
     assert not run_tiled(pipeline, 60, workers=0).failures
     clouds.same_points(whole, tmp_path / "out.laz")
-
-
-def test_ept_source(tmp_path, town_file, model_file, whole):
-    """A hand-made EPT source of one node, read through PDAL by bounds."""
-    las = laspy.read(town_file)
-    root = tmp_path / "ept"
-    for name in ("ept-data", "ept-hierarchy"):
-        (root / name).mkdir(parents=True)
-    las.write(root / "ept-data" / "0-0-0-0.laz")
-    (root / "ept-hierarchy" / "0-0-0-0.json").write_text(json.dumps({"0-0-0-0": len(las)}))
-    low, high = las.xyz.min(axis=0), las.xyz.max(axis=0)
-    side = float((high - low).max())
-    axes = [
-        {"name": n, "type": "signed", "size": 4, "scale": 0.001, "offset": o}
-        for n, o in zip("XYZ", las.header.offsets.tolist(), strict=True)
-    ]
-    others = [
-        {"name": "Intensity", "type": "unsigned", "size": 2},
-        {"name": "Classification", "type": "unsigned", "size": 1},
-        {"name": "GpsTime", "type": "float", "size": 8},
-    ]
-    described = {
-        "bounds": [*low.tolist(), *(low + side).tolist()],
-        "boundsConforming": [*low.tolist(), *high.tolist()],
-        "dataType": "laszip",
-        "hierarchyType": "json",
-        "points": len(las),
-        "schema": axes + others,
-        "span": 128,
-        "srs": {"wkt": WKT},
-        "version": "1.0.0",
-    }
-    (root / "ept.json").write_text(json.dumps(described))
-    pipeline = clouds.stages([town_file], tmp_path / "e_#.laz", model_file)
-    pipeline[0] = {"type": "readers.ept", "filename": str(root / "ept.json")}
-    run = run_tiled(pipeline, 30, workers=0)
-    assert not run.failures and run.summary["per"] == "tile"
-    got = np.concatenate([_table(path) for path in sorted(tmp_path.glob("e_*.laz"))])
-    assert np.array_equal(np.sort(got), np.sort(_table(whole)))
-    # what `classify` says of it to writers, which hold all class codes then
-    assert one_format([str(root / "ept.json")]) == {"minor_version": 4, "dataformat_id": 6}
 
 
 # ---- telling ---------------------------------------------------------------------------------------------

@@ -128,7 +128,7 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, folder, expected):
     _, err = run.communicate(timeout=300)
     assert run.returncode == 1 and "the temporary file could not be written" in err
     assert (
-        "Make room on the disk" in err and "Remove it from the inputs" not in err
+        "Make room on the disk" in err and "among the inputs" not in err
     )  # which are not to blame
     assert [path.name for path in tmp_path.iterdir()] == ["job.json"]
     assert not run_tiled(stages, 20, workers=0, resume=True, buffer=0.0).failures
@@ -149,7 +149,11 @@ def test_unreadable_input(tmp_path, folder, expected):
     stages = pipeline(inputs, tmp_path / "o_#.laz")
     run = run_tiled(stages, 10, workers=0)
     ((what, why),) = run.failures  # told once, whatever waits for it
-    assert "east.laz" in what and "damaged" in why and "20 tiles and 2 outputs depend on it" in why
+    assert (
+        "east.laz" in what
+        and "damaged" in why
+        and "tiles and outputs that need it are not made" in why
+    )
     # West of x = 30 no tile sees the broken file; beside it, neighbors would be missing.
     states = {job.name: job.state for job in run.tiles}
     assert states["20_0"] == states["0_20"] == "done" and states["30_0"] == "failed"
@@ -422,44 +426,6 @@ def test_damaged_results_are_made_anew(tmp_path, folder, expected, monkeypatch):
     )  # found when it is read, not before
     assert not run_tiled(stages, 20, workers=0, resume=True).failures
     check_same(tmp_path, expected)
-
-
-@pytest.mark.parametrize("damage", ["cut", "zeroed", "one byte", "one byte of the halo"])
-def test_damaged_copies_of_inputs_are_made_anew(tmp_path, folder, expected, damage):
-    """What a power failure leaves of the sorted copies does not reach an output at --resume."""
-    stages = pipeline(folder, tmp_path / "o_#.laz")
-    # Tiles are begun from the south-west; the sixth one ends the run.
-    calls = str(tmp_path / "calls")
-    dies = f"""with open({calls!r}, 'a') as file: file.write('x')
-if os.path.getsize({calls!r}) == 6: os.kill(os.getpid(), signal.SIGKILL)"""
-    stages.insert(2, python_filter(dies))
-    run = command(tmp_path / "job.json", stages, "--workers", "0")
-    run.communicate(timeout=300)
-    assert run.returncode == -signal.SIGKILL
-    kept = tmp_path / ".pdal-stages" / "kept"
-    places = {}
-    for copy in kept.glob("*.points"):
-        note = json.loads(copy.with_suffix(".json").read_text())
-        places[note["box"][0] >= 40] = copy, note
-    assert len(places) == 2
-    copy, note = places[False]  # of the western file; its tiles 20_20 and east of it are waiting
-    size, record = copy.stat().st_size, copy.stat().st_size // note["count"]
-    if damage == "cut":
-        os.truncate(copy, size // 2)
-    elif damage == "zeroed":
-        copy.write_bytes(bytes(size))
-    else:  # the height of a point: beyond the tiles that failed, or in them
-        far = damage == "one byte of the halo"
-        first = next(c[2] for c in note["cells"] if c[:2] == ([3, 4] if far else [4, 4]))
-        with open(copy, "r+b") as file:
-            file.seek(first * record + 8 + 8)
-            byte = file.read(1)[0]
-            file.seek(first * record + 8 + 8)
-            file.write(bytes([byte ^ 0x40]))
-    assert not run_tiled(stages, 20, workers=0, resume=True, buffer=0.0).failures
-    (tmp_path / "o_west.laz").rename(tmp_path / "west")
-    (tmp_path / "o_east.laz").rename(tmp_path / "east")
-    assert {name: (tmp_path / name).read_bytes() for name in expected} == expected
 
 
 def test_links_in_place_of_the_runs_own_folders(tmp_path, folder):

@@ -22,7 +22,7 @@ COMMANDS = {
     "extras": ("objects", "review", "corrections", "demo"),
 }
 OVERRIDES = "Stages take options as in PDAL: --stage.TAG.option=V, --filters.name.option=V"
-INPUTS = "Files, folders, patterns, tile indexes, EPT sources"
+INPUTS = "Files, folders, patterns, tile indexes"
 #: What argparse prints where a value is not among the choices.
 _INVALID_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 _WORD = re.compile(r"[\w-]+")

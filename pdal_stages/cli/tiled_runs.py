@@ -45,8 +45,7 @@ def add_tile_options(command: argparse.ArgumentParser, survey: bool = False) -> 
     add = add_tile_sizes(command, f"{when} (docs/large-areas.md).")
     scheduler = "A running Dask scheduler, tcp://HOST:8786"
     add("--scheduler", default="", metavar="ADDRESS", help=scheduler)
-    per = "One output per input or per tile (auto: per input)"
-    add("--per", choices=PER, default="auto", help=per)
+    add("--per", choices=PER, default="file", help="One output per input file or per tile")
     buffer = argparse.SUPPRESS if survey else "How far PDAL's own filters look beyond a tile"
     add("--buffer", type=float, metavar="METERS", help=buffer)
     add("--resume", action="store_true", help="Continue a run that was stopped or failed")

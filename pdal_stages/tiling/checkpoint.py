@@ -84,9 +84,9 @@ class Store:
         self.kept.mkdir()
         shutil.rmtree(old, ignore_errors=True)
 
-    def path(self, name: str, ending: str = ".npz") -> str:
-        """Return the path of a file of arrays or points."""
-        return str(self.kept / f"{name}{ending}")
+    def path(self, name: str) -> str:
+        """Return the path of a file of arrays."""
+        return str(self.kept / f"{name}.npz")
 
     def finish(self, name: str, mark: str, record: Mapping[str, Any]) -> None:
         """Save the record of a finished job.

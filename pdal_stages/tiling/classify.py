@@ -15,10 +15,10 @@ from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs
 from ..base.las_check import beyond_box
 from ..pipeline.classify_request import ClassifyRequest
-from ..pipeline.inputs_outputs import input_files, is_ept, is_folder, is_las, outputs_of
+from ..pipeline.inputs_outputs import input_files, is_folder, is_las, outputs_of
 from ..pipeline.pdal import knows_copc, writer_of
 from .inputs import InputSource, one_format
-from .jobs import Job, TiledRun, messages_on_folders
+from .jobs import Job, TiledRun
 from .options import TilingOptions, fits_whole
 
 
@@ -26,7 +26,7 @@ from .options import TilingOptions, fits_whole
 class ClassifyTask:
     """Inputs, output and settings of a classification."""
 
-    inputs: tuple[str, ...]  #: files, folders, patterns, tile indexes, EPT sources
+    inputs: tuple[str, ...]  #: files, folders, patterns, tile indexes
     output: str  #: a file; of several inputs a folder, or a name with ``#`` for the input's
     request: ClassifyRequest = field(default_factory=ClassifyRequest)
     options: TilingOptions = field(default_factory=TilingOptions)
@@ -41,17 +41,17 @@ class ClassifyTask:
     def in_one_piece(self) -> bool:
         """Return whether one input fits into memory, and no option asks for tiles."""
         options = self.options
-        tiles = options.tile is not None or options.per != "auto"
+        tiles = options.tile is not None or options.per != "file"
         if len(self.files) > 1 or tiles or options.scheduler or options.resume:
             return False
         if not is_las(self.files[0]):
-            return not is_ept(self.files[0])
+            return True
         header = las.header_there(self.files[0])
         return header is None or fits_whole(header.count, options.memory)
 
     @property
     def _per_tile(self) -> bool:
-        return self.options.per == "tile" or any(map(is_ept, self.files))
+        return self.options.per == "tile"
 
     @cached_property
     def outputs(self) -> list[str]:
@@ -95,21 +95,19 @@ class ClassifyTask:
             "inputs": 1,
             "bounds": list(header.box) if header and header.count else None,
         }
-        output = Job(source, source=InputSource(source, {}, "las"), outputs=[target])
+        output = Job(source, source=InputSource(source, {}), outputs=[target])
         if dry_run:
             self.request.pipeline(source, target)
             check_outputs(self.extra_files, self.inputs)
             summary |= {"points": header.count if header else 0, "states": {"waiting": 0}}
             return TiledRun([], [output], {}, [], [], summary)
         seconds, cpu_seconds = time.perf_counter(), time.process_time()
-        messages = messages_on_folders([target], [source]) if is_folder(self.output) else []
         with self.folders():
             pipeline = self.request.pipeline(source, target)
             pipeline.check_outputs(*self.extra_files, read=self.inputs)
             count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
         messages = [
             *(f"PDAL says: {line}" for line in pipeline.log_lines),
-            *messages,
             *pipeline.messages,
         ]
         if header is not None and is_las(target) and (written := las.read_header(target)):
@@ -137,10 +135,10 @@ class ClassifyTask:
         from .plan import plan_of_files
         from .tiled_run import run_plan
 
-        if odd := [name for name in self.files if not is_las(name) and not is_ept(name)]:
+        if odd := [name for name in self.files if not is_las(name)]:
             raise OptionError(
-                "several inputs, and the options of tiles, need LAS, LAZ, COPC or EPT, which can "
-                "be cut into tiles",
+                "several inputs, and the options of tiles, need LAS, LAZ or COPC, which can be cut "
+                "into tiles",
                 found=odd[0],
                 cure="Convert them first (pdal translate INPUT input.laz), or classify them one at "
                 "a time without "

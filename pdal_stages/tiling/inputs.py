@@ -16,160 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import las, las_check
-from ..base.errors import OptionError, PipelineError, StageError
-from ..base.octree_check import check_ept, read_ept
+from ..base.errors import PipelineError, StageError
 from ..base.units import Units
-from ..pipeline import pdal as pdal_env
-from ..pipeline.expansion import stage_files
-from ..pipeline.inputs_outputs import (
-    LAS_READERS,
-    ept_address,
-    is_ept,
-    is_las,
-    locations,
-    named_files,
-)
+from ..pipeline.inputs_outputs import LAS_READERS, locations
 from ..pipeline.las_output import replaced
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
-from ..stages.registry import stage_from, stage_types
 from .checkpoint import fingerprint
 from .options import Density, Extent, TilingOptions, block_bytes, choose_tiles, tiles_per_square
 from .plan import TilePlan, outputs_for
 from .tile_grid import Box, TileGrid, check_number, touching, union
-
-#: Options of readers.tindex that select files or points, or change them.
-_TINDEX_QUERIES = ("bounds", "polygon", "where", "sql", "count", "srs_column", "t_srs")
-
-
-@dataclass(frozen=True)
-class InputSource:
-    """One input."""
-
-    path: str  #: absolute, or an address
-    reader: dict[str, Any]  #: the stage that reads it
-    kind: str  #: ``las`` (LAS, LAZ, COPC) or ``ept``
-
-    @property
-    def key(self) -> str:
-        """A short identifier, the same in every run."""
-        return hashlib.sha1(os.fsencode(self.path)).hexdigest()[:12]
-
-    def clip(self, box: Box) -> dict[str, Any]:
-        """Return the reader of an EPT source, restricted to a box."""
-        x0, y0, x1, y1 = box
-        bounds = f"([{x0!r}, {x1!r}], [{y0!r}, {y1!r}])"
-        return {**self.reader, "filename": self.path, "bounds": bounds}
-
-
-def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
-    """Return the inputs of readers: names, patterns, EPT addresses, tile indexes.
-
-    PipelineError where one cannot be cut.
-    """
-    sources: dict[str, InputSource] = {}
-    for reader in readers:
-        options = {k: v for k, v in reader.items() if k not in ("filename", "tag", "inputs")}
-        name = reader.get("filename", "")
-        paths: list[str] = name if isinstance(name, list) else [str(name)]
-        kind = "ept" if reader["type"] == "readers.ept" else "las"
-        if kind == "ept":
-            paths = [ept_address(path) for path in paths]
-        else:
-            if reader["type"] == "readers.tindex":
-                paths, options = _indexed_files(reader, options)
-            elif reader["type"] not in LAS_READERS:
-                raise PipelineError(
-                    f"{reader['type']} cannot read a part of a file, so it cannot be cut into "
-                    "tiles",
-                    found=name,
-                    cure="Convert the input first: pdal translate INPUT input.laz",
-                )
-            elif isinstance(name, str) and not os.path.exists(name) and glob.has_magic(name):
-                paths = sorted(glob.glob(name, recursive=True))
-                if not paths:
-                    raise PipelineError(
-                        "no file matches the reader's pattern", where=reader["type"], found=name
-                    )
-            paths = [os.path.abspath(path) for path in paths]
-            for path in paths:
-                las.refuse_pipe(path)
-            options["type"] = "readers.las"
-        for path in paths:
-            sources.setdefault(path, InputSource(path, options, kind))
-    return list(sources.values())
-
-
-def _indexed_files(
-    reader: dict[str, Any], options: dict[str, Any]
-) -> tuple[list[str], dict[str, Any]]:
-    """Return the files of a tile index, and the options for their readers."""
-    if queries := [name for name in _TINDEX_QUERIES if name in reader]:
-        raise PipelineError(
-            "in tiles, all files of a tile index are read whole and in their own spatial reference",
-            where="readers.tindex",
-            found=", ".join(queries),
-            cure="Leave these options out, or make an index of the files you mean",
-        )
-    paths = locations(str(reader["filename"]), str(options.get("tindex_name", "location")))
-    return paths, {k: v for k, v in options.items() if k in ("override_srs", "default_srs")}
-
-
-def read_extent(source: InputSource) -> Extent:
-    """Return the number of points and the bounding box of an input, from its header.
-
-    StageError where these cannot be read.
-    """
-    if source.kind != "ept":
-        return las_extent(source.path)
-    described = check_ept(source.path)
-    x0, y0, _, x1, y1, _ = map(float, described["boundsConforming"])
-    return Extent(int(described["points"]), (x0, y0, x1, y1))
-
-
-def las_extent(path: str) -> Extent:
-    """Return the number of points and the bounding box in the header of a LAS or LAZ file."""
-    try:
-        header = las.read_header(path)
-    except OSError as error:
-        raise StageError("the input cannot be read", where=path, found=error) from None
-    if header is None:
-        raise StageError("the input is not a LAS or LAZ file", where=path)
-    x0, y0, x1, y1 = header.box
-    if header.count and not (math.isfinite(x1 - x0 + y1 - y0) and x0 <= x1 and y0 <= y1):
-        raise StageError(
-            "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
-        )
-    return Extent(header.count, header.box)
-
-
-# ---- EPT sources ---------------------------------------------------------------------------------
-
-
-def ept_form(described: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options of ``writers.las`` for an EPT source: its scales, offsets and colors."""
-    axes = {dimension["name"]: dimension for dimension in described["schema"]}
-    colored = 8 if "Infrared" in axes else 7 if "Red" in axes else 6
-    form: dict[str, Any] = {"minor_version": 4, "dataformat_id": colored}
-    for axis in "XYZ":
-        form[f"scale_{axis.lower()}"] = float(axes.get(axis, {}).get("scale") or 0.001)
-        form[f"offset_{axis.lower()}"] = float(axes.get(axis, {}).get("offset") or 0.0)
-    return form
-
-
-def fetch_ept(source: InputSource, box: Box, target: str) -> bool:
-    """Read the points of an EPT source in a box into a LAS file; return whether there are any.
-
-    Scales and offsets are the source's, so coordinates do not change; other dimensions become extra
-    dimensions.
-    """
-    form = {**ept_form(read_ept(source.path)), "extra_dims": "all"}
-    run = pdal_env.execute(
-        [source.clip(box), {"type": "writers.las", "filename": target, **form}], arrays=False
-    )
-    return bool(run.count and las_extent(target).count)
-
-
-# ---- all inputs ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -182,19 +37,19 @@ class CloudIndex:
     #: (n, 4): column, row, index of the first point in the copy, number of points
     cells: NDArray[np.int64]
     grid: TileGrid  #: of the cells
-    copy: str  #: the file with the points
-    checksum: int  #: CRC-32 of the copy
     digest: str  #: SHA-256 of the input
     changed_ns: int  #: time of the input's last change of content or status, which no program sets
+    copy: str = ""  #: the file with the points; empty where an earlier run had it
 
     @classmethod
-    def parse(cls, record: dict[str, Any], copy: str) -> CloudIndex:
+    def parse(cls, record: dict[str, Any], copy: str = "") -> CloudIndex:
         """Return the index that :func:`sort_points` has described."""
         cells = np.array(record["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in record["tiles"]]
-        sums = int(record["checksum"]), str(record["digest"]), int(record["changed_ns"])
         grid = TileGrid(*map(float, record["grid"]))
-        return cls(int(record["count"]), tuple(record["box"]), tiles, cells, grid, copy, *sums)
+        digest, changed_ns = str(record["digest"]), int(record["changed_ns"])
+        box = tuple(record["box"])
+        return cls(int(record["count"]), box, tiles, cells, grid, digest, changed_ns, copy)
 
     def is_of(self, path: str) -> bool:
         """Return whether the input still holds the bytes that were read.
@@ -208,8 +63,85 @@ class CloudIndex:
             return False
 
 
-#: An input with the index of its points; EPT sources have none.
-IndexedSource = tuple[InputSource, CloudIndex | None]
+@dataclass
+class InputSource:
+    """One input, a LAS, LAZ or COPC file, and what is known of it."""
+
+    path: str  #: absolute
+    reader: dict[str, Any]  #: the stage that reads it, without the file's name
+    extent: Extent | None = None  #: None where the header cannot be read
+    stamp: Sequence[int] = ()  #: size and time at the start of the run
+    fault: str = ""  #: why it cannot be read
+    index: CloudIndex | None = None  #: once it was read
+
+    @property
+    def key(self) -> str:
+        """A short identifier, the same in every run."""
+        return hashlib.sha1(os.fsencode(self.path)).hexdigest()[:12]
+
+    @property
+    def box(self) -> Box | None:
+        """The box of its points, as far as they are known; None where it has none."""
+        if self.extent is None or not self.extent.count:
+            return None
+        return self.index.box if self.index and self.index.count else self.extent.box
+
+    @property
+    def content(self) -> list[Any]:
+        """Its name, reader and digest; size and time before it was read."""
+        return [self.path, self.reader, self.index.digest if self.index else self.stamp]
+
+
+def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
+    """Return the inputs of readers: names, patterns, tile indexes.
+
+    PipelineError where one cannot be cut.
+    """
+    sources: dict[str, InputSource] = {}
+    for reader in readers:
+        options = {k: v for k, v in reader.items() if k not in ("filename", "tag", "inputs")}
+        name: Any = reader.get("filename", "")
+        if reader["type"] == "readers.tindex":
+            paths = locations(str(name), str(options.get("tindex_name", "location")))
+            options = {k: v for k, v in options.items() if k in ("override_srs", "default_srs")}
+        elif reader["type"] not in LAS_READERS:
+            raise PipelineError(
+                f"{reader['type']} cannot read a part of a file, so it cannot be cut into tiles",
+                found=name,
+                cure="Convert the input first: pdal translate INPUT input.laz",
+            )
+        elif isinstance(name, list):
+            paths = name
+        else:
+            there = os.path.exists(name) or not glob.has_magic(name)
+            paths = [name] if there else sorted(glob.glob(name, recursive=True))
+            if not paths:
+                raise PipelineError(
+                    "no file matches the reader's pattern", where=reader["type"], found=name
+                )
+        for path in map(os.path.abspath, paths):
+            las.refuse_pipe(path)
+            sources.setdefault(path, InputSource(path, {**options, "type": "readers.las"}))
+    return list(sources.values())
+
+
+def las_extent(path: str) -> Extent:
+    """Return the number of points and the bounding box in the header of a LAS or LAZ file.
+
+    StageError where these cannot be read.
+    """
+    try:
+        header = las.read_header(path)
+    except OSError as error:
+        raise StageError("the input cannot be read", where=path, found=error) from None
+    if header is None:
+        raise StageError("the input is not a LAS or LAZ file", where=path)
+    x0, y0, x1, y1 = header.box
+    if header.count and not (math.isfinite(x1 - x0 + y1 - y0) and x0 <= x1 and y0 <= y1):
+        raise StageError(
+            "the header has no bounding box", where=path, found=f"x {x0} to {x1}, y {y0} to {y1}"
+        )
+    return Extent(header.count, header.box)
 
 
 class Survey:
@@ -225,36 +157,25 @@ class Survey:
         """
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
-        self.unreadable: dict[str, str] = {}  #: unreadable inputs by path, and why
-        self.extents: dict[str, Extent] = {}  #: of inputs by path, where the header can be read
-        #: of LAS and LAZ files by path, once they were read
-        self.indexes: dict[str, CloudIndex] = {}
         self.sources = find_sources(plan.readers)
         self.paths = [source.path for source in self.sources]
-        self._others = files_read_by([*plan.head, *plan.tail])
-        #: Sizes and times of inputs, and of other files that stages read, at the start of the run.
-        self.stamps = {path: stamp(path) for path in [*self.paths, *self._others]}
+        #: Sizes and times of the files that stages read, at the start of the run.
+        self._others = {path: stamp(path) for files in plan.files for path in files}
         self._read_headers()
-        files_of_las = [source.path for source in self.sources if source.kind == "las"]
-        self.messages += replaced(files_of_las, plan.makes)
-        files = all(source.kind == "las" for source in self.sources)
-        if options.per == "file" and not files:
-            raise OptionError("--per file needs LAS or LAZ inputs", cure="Use --per tile")
-        #: ``file`` or ``tile``: what an output corresponds to.
-        self.per = options.per if options.per != "auto" else "file" if files else "tile"
+        self.messages += replaced(self.paths, plan.makes)
         #: What each of the writers writes of each input; empty where each tile is an output.
-        self.outputs = outputs_for(plan, self.paths) if self.per == "file" else []
-        self.unit = self._unit(plan)  #: meters per unit of the coordinates
+        self.outputs = outputs_for(plan, self.paths) if options.per == "file" else []
+        self.unit = self._unit(plan, options.per)  #: meters per unit of the coordinates
         self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
         self.place()
-        self.density = Density.measure(self.extents.values())
+        self.density = Density.measure(filter(None, (source.extent for source in self.sources)))
         #: Memory of a worker for the rounds before the tiles.
         self.block_bytes = (
             block_bytes(plan.blocks, self.density.area * self.unit**2) if plan.blocks else 0.0
         )
         sized = replace(options, tile=earlier["tile"]) if earlier else options
         self.options, self.grid = choose_tiles(
-            sized, self.density, self.halo_units, self.per == "file", self.block_bytes
+            sized, self.density, self.halo_units, self.block_bytes
         )
         if earlier:
             self.grid = TileGrid(self.grid.size, earlier["origin"])
@@ -268,28 +189,24 @@ class Survey:
     def _read_headers(self) -> None:
         odd: list[str] = []
         for source in self.sources:
+            source.stamp = stamp(source.path)
             try:
-                self.extents[source.path] = read_extent(source)
+                source.extent = las_extent(source.path)
                 if any("\ud800" <= character <= "\udfff" for character in source.path):
-                    raise StageError(
-                        "the name of the file is not UTF-8",
-                        where=source.path,
-                        cure="Rename the file",
-                    )
-                if source.kind == "las":
-                    odd += filter(None, [las_check.check_readable(source.path)])
+                    raise StageError("the name of the file is not UTF-8", cure="Rename the file")
+                odd += filter(None, [las_check.check_readable(source.path)])
             except StageError as error:
-                self.unreadable[source.path] = str(error)
+                source.fault = str(error)
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
         self.messages += [f"{message}{more}" for message in odd[:1]]
-        if lost := len(self.sources) - len(self.extents):
+        if lost := sum(source.extent is None for source in self.sources):
             self.messages.append(
                 f"{lost:,} of the inputs have no readable header: where they lie is not known, and "
-                "tiles beside them may "
-                "lack neighbors. Once they can be read, --resume runs those tiles again"
+                "tiles beside them may lack neighbors. Once they can be read, --resume runs those "
+                "tiles again"
             )
 
-    def _unit(self, plan: TilePlan) -> float:
+    def _unit(self, plan: TilePlan, per: str) -> float:
         """Return meters per unit of the coordinates.
 
         Inputs that stages see together must have the same reference.
@@ -297,19 +214,14 @@ class Survey:
         needed = bool(plan.head and plan.sees_m)
         known: dict[str, Reference] = {}  # PDAL is asked once for equal references
         references: dict[str, Reference] = {}
-        for source in self.sources:
-            if source.path in self.unreadable:
-                continue
-            ept = source.kind == "ept"
-            projection = (
-                read_ept(source.path).get("srs") if ept else las.projection_digest(source.path)
-            )
-            kind = fingerprint(source.reader, projection)
+        for source in self.readable():
+            kind = fingerprint(source.reader, las.projection_digest(source.path))
             try:
-                if kind not in known:
-                    known[kind] = self._reference_of(source, plan.unit)
+                if kind not in known:  # as PDAL's reader reports it after one point
+                    reader = {**source.reader, "filename": source.path, "count": 1}
+                    known[kind] = reference_of(reader, plan.unit)
             except PipelineError as error:
-                self.unreadable[source.path] = str(error)
+                source.fault = str(error)
                 continue
             except StageError:
                 if needed:
@@ -317,24 +229,17 @@ class Survey:
                 known[kind] = Reference(Units())  # no stage needs it
             references[source.path] = known[kind]
         if not references:
-            reasons = iter(self.unreadable.values())
+            reasons = (source.fault for source in self.sources)
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if needed:
             messages = check_one_reference(references)
-            if messages and self.per == "file":
+            if messages and per == "file":
                 messages[0] += (
                     ", and the output gets none: --readers.las.default_srs=EPSG:CODE names it in "
                     "both"
                 )
             self.messages += messages
         return next(iter(references.values())).units.horizontal
-
-    def _reference_of(self, source: InputSource, horizontal: str) -> Reference:
-        """Return the reference of an input, as PDAL's reader reports it after few points."""
-        if source.kind == "las":
-            return reference_of({**source.reader, "filename": source.path, "count": 1}, horizontal)
-        x, y, _, _ = self.extents[source.path].box
-        return reference_of(source.clip((x, y, x + 1, y + 1)), horizontal)
 
     @property
     def layout(self) -> dict[str, float]:
@@ -344,15 +249,9 @@ class Survey:
 
     def place(self) -> None:
         """Collect the boxes of inputs from headers or indexes, as an array for fast comparison."""
-        self.placed = [
-            s for s in self.sources if s.path in self.extents and self.extents[s.path].count
-        ]
-        boxes = []
-        for source in self.placed:
-            index = self.indexes.get(source.path)
-            boxes.append(index.box if index and index.count else self.extents[source.path].box)
-        self._boxes = np.array(boxes, np.float64)
-        self.bounds: Box = union(boxes)
+        self.placed = [source for source in self.sources if source.box]
+        self._boxes = np.array([source.box for source in self.placed], np.float64)
+        self.bounds: Box = union(self._boxes)
 
     @cached_property
     def _contents(self) -> dict[str, Any]:
@@ -361,25 +260,18 @@ class Survey:
         A run that is only planned (``--dry-run``) does not read them.
         """
         return {
-            path: digest_of(path) if os.path.isfile(path) else stamp(path) for path in self._others
+            path: digest_of(path) if os.path.isfile(path) else before
+            for path, before in self._others.items()
         }
 
-    def stamps_of(self, stages: list[dict[str, Any]]) -> list[Any]:
-        """Return names and contents (digests) of the models, maps and other files of stages."""
-        return [[path, self._contents[path]] for path in files_read_by(stages)]
-
-    def seen(self, sources: list[InputSource]) -> list[Any]:
-        """Return names, readers and contents of inputs: digests, or sizes and times without."""
-        return [
-            [source.path, source.reader, self.indexes[source.path].digest]
-            if source.path in self.indexes
-            else [source.path, source.reader, self.stamps[source.path]]
-            for source in sources
-        ]
+    def stamps_of(self, files: Sequence[Sequence[str]]) -> list[Any]:
+        """Return names and contents (digests) of files that stages read."""
+        return [[path, self._contents[path]] for each in files for path in each]
 
     def changed(self) -> list[str]:
         """Return the inputs and other files that changed since the run began."""
-        return [path for path, before in self.stamps.items() if stamp(path) != before]
+        stamps = {source.path: source.stamp for source in self.sources} | self._others
+        return [path for path, before in stamps.items() if stamp(path) != before]
 
     def near(self, tile: tuple[int, int], halo_units: float) -> list[InputSource]:
         """Return the inputs that may have points in a tile or its halo."""
@@ -389,19 +281,24 @@ class Survey:
         """Return the inputs that may have points in a box."""
         return [self.placed[n] for n in touching(self._boxes, box)]
 
-    def readable(self, sources: list[InputSource]) -> list[IndexedSource]:
-        """Return the inputs that are readable, with the index of their points."""
-        return [(s, self.indexes.get(s.path)) for s in sources if s.path not in self.unreadable]
+    @property
+    def faults(self) -> dict[str, str]:
+        """Return the inputs that cannot be read, and why."""
+        return {source.path: source.fault for source in self.sources if source.fault}
+
+    def readable(self) -> list[InputSource]:
+        """Return the inputs without faults."""
+        return [source for source in self.sources if not source.fault]
 
     def tiles(self) -> dict[tuple[int, int], int]:
         """Return all tiles that may have points, row by row, with their number (0: unknown)."""
         counts: dict[tuple[int, int], int] = {}
-        for path, header in self.extents.items():
-            if path in self.indexes:
-                for i, j, n in self.indexes[path].tiles:
+        for source in self.sources:
+            if source.index is not None:
+                for i, j, n in source.index.tiles:
                     counts[i, j] = counts.get((i, j), 0) + n
-            elif header.count:
-                for tile in self.grid.covering(header.box):
+            elif source.box is not None:
+                for tile in self.grid.covering(source.box):
                     counts.setdefault(tile, 0)
         check_number(len(counts), f"tiles of {self.grid.size:g}")
         return dict(sorted(counts.items(), key=lambda item: (item[0][1], item[0][0])))
@@ -415,17 +312,10 @@ class Survey:
             "tile": self.grid.size,
             "halo_m": plan.halo_m,
             "meters_per_unit": self.unit,
-            "per": self.per,
+            "per": self.options.per,
             "inputs": len(self.sources),
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
         }
-
-
-def files_read_by(stages: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the files that stages read: models, maps and what else PDAL's options name."""
-    ours = [stage_from(stage) for stage in stages if stage["type"] in stage_types()]
-    files = [path for stage in ours for path in stage_files(stage) if os.path.exists(path)]
-    return list(dict.fromkeys([*named_files(stages), *files]))
 
 
 def digest_of(path: str | os.PathLike) -> str:
@@ -453,27 +343,14 @@ def one_format(paths: Sequence[str]) -> dict[str, Any]:
     of the inputs: PDAL only forwards what all inputs of a tile share, and otherwise uses scales of
     a centimeter and point format 3. Unreadable inputs are reported later.
     """
-    formats: set[int] = set()
-    places: set[tuple[float, ...]] = set()
-    for path in paths:
-        try:
-            if is_ept(path):
-                form = ept_form(read_ept(path))
-                formats.add(form["dataformat_id"])
-                places.add(
-                    tuple(form[f"{what}_{axis}"] for what in ("scale", "offset") for axis in "xyz")
-                )
-            elif is_las(path) and (header := las.read_header(path)) and header.count:
-                formats.add(header.point_format)
-                places.add((*header.scales, *header.offsets))
-        except (OSError, StageError, ValueError, TypeError):
-            continue
+    headers = [header for path in paths if (header := las.header_there(path)) and header.count]
     options: dict[str, Any] = {}
-    if len(formats) > 1 or any(map(is_ept, paths)):
+    formats = {header.point_format for header in headers}
+    if len(formats) > 1:
         colored = 8 if 8 in formats else 7 if formats & {2, 3, 7} else 6
         options = {"minor_version": 4, "dataformat_id": colored}
     for axis, name in enumerate("xyz"):
-        along = {(place[axis], place[3 + axis]) for place in places}
+        along = {(header.scales[axis], header.offsets[axis]) for header in headers}
         if len(along) > 1:
             scale, offset = min(along, key=lambda place: (place[0], -abs(place[1])))
             # Of newer PDAL "auto" is the tile's middle, off the grid of the coordinates: only for

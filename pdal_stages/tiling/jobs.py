@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
 
 #: Most distinct warnings of tiles that a run repeats (not tuned).
 _MOST_MESSAGES = 20
+_BLOCKS = " (tiles and outputs that need it are not made. Without it among the inputs they are)"
 _CHANGED = (
     "it changed during the run, so outputs may hold results from before and after. Once it no "
     "longer changes, run it again with --resume"
@@ -43,16 +43,16 @@ class Job:
     #: fingerprint.
     record: dict[str, Any] = field(default_factory=dict)
     reason: str = ""  #: why it failed
-    blocked_by: str = ""  #: the unreadable input that is the reason, if any
+    blocked: bool = False  #: an unreadable input is the reason
 
     @property
     def is_output(self) -> bool:
         """Return whether it is an output that is assembled from tiles."""
         return self.source is not None and self.outputs is not None
 
-    def fail(self, reason: str, blocked_by: str = "") -> None:
+    def fail(self, reason: str, blocked: bool = False) -> None:
         """Mark it as failed."""
-        self.state, self.reason, self.blocked_by = "failed", reason, blocked_by
+        self.state, self.reason, self.blocked = "failed", reason, blocked
 
     def fail_with(self, needed: Iterable[Job]) -> None:
         """Mark it as failed where any job that it needs has failed."""
@@ -95,25 +95,10 @@ class TiledRun:
         jobs = [(f"tile {job.name}", job) for job in self.tiles]
         jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
         return [
-            *(
-                (p, why.removeprefix(f"{p}: ") + self._blocked(p))
-                for p, why in self.unreadable.items()
-            ),
+            *((p, why.removeprefix(f"{p}: ") + _BLOCKS) for p, why in self.unreadable.items()),
             *((path, _CHANGED) for path in self.changed),
-            *((what, job.reason) for what, job in jobs if job.reason and not job.blocked_by),
+            *((what, job.reason) for what, job in jobs if job.reason and not job.blocked),
         ]
-
-    def _blocked(self, path: str) -> str:
-        """Return a remark on the jobs that an unreadable input blocks."""
-        tiles, outputs = (
-            sum(job.blocked_by == path for job in jobs) for jobs in (self.tiles, self.outputs)
-        )
-        if not tiles and not outputs:
-            return ""
-        return (
-            f" ({count_of(tiles, 'tile')} and {count_of(outputs, 'output')} depend on it and are "
-            "not made. Remove it from the inputs to make them without it)"
-        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able report."""
@@ -161,38 +146,6 @@ def summarize(
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
         "left_alone": dict(left_alone),
     }
-
-
-def messages_on_folders(
-    outputs: Iterable[str], inputs: Iterable[str], resumed: bool = False
-) -> list[str]:
-    """Return messages on LAS and LAZ files in the output folders before a run.
-
-    Outputs that are there will be replaced, unless the run is `resumed` and may keep them; others
-    stay.
-    """
-    names = {os.path.realpath(name) for name in outputs}
-    present = {
-        entry.path
-        for folder in filter(os.path.isdir, {os.path.dirname(name) for name in names})
-        for entry in os.scandir(folder)
-        if entry.name.lower().endswith((".las", ".laz")) and entry.is_file()
-    }
-    kinds = (
-        (set() if resumed else names & present, "existing output file", "replaced"),
-        (
-            present - names - {os.path.realpath(name) for name in inputs},
-            "LAS or LAZ file",
-            "in the folder of the outputs not written by this run, left as before",
-        ),
-    )
-    messages = []
-    for paths, kind, fate in kinds:
-        listed = sorted(map(os.path.basename, paths))
-        more = ", ..." if len(listed) > 3 else ""
-        if listed:
-            messages.append(f"{count_of(len(listed), kind)} {fate}: {', '.join(listed[:3])}{more}")
-    return messages
 
 
 def messages_of(

@@ -17,7 +17,7 @@ from ..stages.base import Blocks
 from .tile_grid import Box, TileGrid, union
 
 #: Ways to cut the output.
-PER = ("auto", "file", "tile")
+PER = ("file", "tile")
 #: Largest side of a tile, in units of the coordinates, and buffer: more than the Earth's
 #: circumference in feet.
 LARGEST_TILE = 1e9
@@ -60,9 +60,8 @@ class TilingOptions:
     #: address of a running Dask scheduler, ``tcp://host:8786``, instead of processes on this
     #: machine
     scheduler: str = ""
-    #: ``file``: one output for each input, in its order of points; ``tile``: one for each;
-    #: ``auto``: file, but for EPT
-    per: str = "auto"
+    #: what has an output of its own: each input ``file``, in its order of points, or each ``tile``
+    per: str = "file"
     #: meters of halo for PDAL filters that look at neighbors, beside what our stages ask for
     buffer: float | None = None
     #: bytes for all local processes together, with a scheduler for each worker; default: half of
@@ -187,7 +186,7 @@ def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool
 
 
 def choose_tiles(
-    options: TilingOptions, density: Density, halo_units: float, per_file: bool, block: float = 0.0
+    options: TilingOptions, density: Density, halo_units: float, block: float = 0.0
 ) -> tuple[TilingOptions, TileGrid]:
     """Choose tiles and the number of workers that fit into memory.
 
@@ -199,9 +198,9 @@ def choose_tiles(
     # Tiles with a few points at least, and not too many.
     fair = [side for side in _SIDES if density.each * side**2 <= _MOST_OF_A_TILE] or _SIDES[:1]
     sides = fair if options.tile is None else [options.tile]
+    largest = density.largest if options.per == "file" else 0
 
     def needed(side: float) -> float:
-        largest = density.largest if per_file else 0
         return worker_bytes(density.read_by(side, halo_units), largest, block)
 
     # A small survey in one tile needs neither surroundings nor rounds before.
@@ -210,7 +209,7 @@ def choose_tiles(
     alone = density.grid_around() if may_be_alone and small else None
     if alone is not None:
         free = whole - (PARENT if local else 0)
-        if worker_bytes(density.points, density.largest if per_file else 0) <= free:
+        if worker_bytes(density.points, largest) <= free:
             workers = local if fixed else min(local, 1)
             return replace(options, tile=alone.size, workers=workers), alone
     for workers in [local] if fixed else range(local, 0, -1):

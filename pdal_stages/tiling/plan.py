@@ -11,7 +11,8 @@ from typing import Any
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.model_file import shipped
-from ..pipeline.inputs_outputs import is_ept, named_outputs, outputs_of, writes_las
+from ..pipeline.expansion import stage_files
+from ..pipeline.inputs_outputs import named_files, named_outputs, outputs_of, writes_las
 from ..pipeline.json_source import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import MOVING
@@ -42,6 +43,8 @@ _GLOBAL = (
     "locate mad mortonorder "
     "randomize relaxationdartthrowing returns shell sort splitter stats tail teaser"
 )
+#: Options of readers that select points or files, or change them.
+_SELECTING = "count start bounds polygon resolution where sql srs_column t_srs"
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,8 @@ class TilePlan:
     rounds: list[Round]  #: the head in parts; the last one, which may be empty, runs on the tiles
     #: Stages that process single points, and the writers: run on the points of one output.
     tail: list[dict[str, Any]]
+    #: Files that each stage reads, of the head and then of the tail: models, maps and more.
+    files: list[list[str]]
     sees_m: float  #: meters around a tile within which points may matter
     #: Dimensions that the head changes; None where unknown because of PDAL's filters in it.
     creates: list[str] | None
@@ -156,6 +161,13 @@ class _Step:
     def sees_neighbors(self) -> bool:
         return self.ours is not None or self.type.removeprefix("filters.") not in _PER_POINT.split()
 
+    @property
+    def files(self) -> list[str]:
+        """Return the existing files that it reads: of PDAL's stages all that options name."""
+        read = [] if self.ours is None else stage_files(self.ours)
+        paths = map(os.path.abspath, (*named_files([self.options]), *read))
+        return [path for path in dict.fromkeys(paths) if os.path.exists(path)]
+
     def sees_results_of(self, earlier: _Step) -> bool:
         """Return whether an earlier step's results at neighbors can change a point's."""
         return self.ours is None or earlier.ours is None or self.ours.sees_results_of(earlier.ours)
@@ -195,8 +207,9 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     return TilePlan(
         readers=[step.options for step in readers],
         head=[_for_workers(step) for step in head],
-        rounds=_rounds(readers, head, reaches),
+        rounds=_rounds(head, reaches),
         tail=[step.options for step in [*tail, *writers]],
+        files=[step.files for step in [*head, *tail, *writers]],
         sees_m=sees_m,
         creates=None if foreign else list(makes),
         makes=makes,
@@ -206,29 +219,18 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     )
 
 
-def readers_of(files: Sequence[str]) -> list[dict[str, Any]]:
-    """Return a reader for each kind of input, with all its files."""
-    readers: list[dict[str, Any]] = []
-    # PDAL reads extra dimensions of LAS 1.0-1.3 only with this option.
-    for kind, more in (("readers.las", {"use_eb_vlr": True}), ("readers.ept", {})):
-        if names := [name for name in files if is_ept(name) == (kind == "readers.ept")]:
-            readers.append({"type": kind, "filename": names, "tag": "input", **more})
-    return readers
-
-
 def plan_of_files(
     files: Sequence[str],
     stages: Sequence[dict[str, Any]],
     overrides: Iterable[Override],
     buffer: float | None = None,
 ) -> tuple[TilePlan, Pipeline]:
-    """Plan stages after readers of files; return the pipeline with an input of each kind, too."""
-    readers = readers_of(files)
-    heads = [{**reader, "filename": reader["filename"][0]} for reader in readers]
-    pipeline = Pipeline([*heads, *stages], overrides, whole=False)
+    """Plan stages after a reader of files; return the pipeline with the first one, too."""
+    # PDAL reads extra dimensions of LAS 1.0-1.3 only with the last option.
+    reader = {"type": "readers.las", "filename": files[0], "tag": "input", "use_eb_vlr": True}
+    pipeline = Pipeline([reader, *stages], overrides, whole=False)
     plan = make_plan(pipeline, buffer)
-    for settled, reader in zip(plan.readers, readers, strict=True):
-        settled["filename"] = reader["filename"]
+    plan.readers[0]["filename"] = list(files)
     return plan, pipeline
 
 
@@ -247,7 +249,7 @@ def _round(head: list[_Step], reaches: list[float], begin: int, end: int, **fact
     return Round(begin, end, used, upstream, halo, **facts)
 
 
-def _rounds(readers: list[_Step], head: list[_Step], reaches: list[float]) -> list[Round]:
+def _rounds(head: list[_Step], reaches: list[float]) -> list[Round]:
     """Cut the head before stages that look far: they see saved results of those before.
 
     Blocks serve the first far-reaching stage, which then needs no halo.
@@ -258,7 +260,7 @@ def _rounds(readers: list[_Step], head: list[_Step], reaches: list[float]) -> li
         blocks = first_round_of(step.ours)
         if open_ended or any(part.blocks for part in rounds):
             blocks = None
-        kept = _kept(readers, head[:at])
+        kept = _kept(head[:at])
         if blocks is not None or (kept is not None and at > begin and reaches[at] > _FAR_M):
             rounds.append(_round(head, reaches, begin, at, kept=kept or [], blocks=blocks))
             begin = begin if kept is None else at
@@ -266,19 +268,17 @@ def _rounds(readers: list[_Step], head: list[_Step], reaches: list[float]) -> li
             reaches = [*reaches[:at], 0.0, *reaches[at + 1 :]]
         open_ended = open_ended or (step.ours is not None and step.ours.open_ended)
     rounds.append(_round(head, reaches, begin, len(head)))
-    kept = _kept(readers, head)
+    kept = _kept(head)
     if kept and rounds[-1].halo_m > _FAR_M:  # on squares, of which tiles then take their points
         rounds[-1] = replace(rounds[-1], kept=kept)
         rounds.append(_round(head, reaches, len(head), len(head)))
     return rounds
 
 
-def _kept(readers: list[_Step], before: list[_Step]) -> list[str] | None:
+def _kept(before: list[_Step]) -> list[str] | None:
     """Return the dimensions that stages change, if saving these is enough; else None."""
     if any(step.ours is None and step.type != "filters.merge" for step in before):
         return None  # which may drop points
-    if before and any(step.type == "readers.ept" for step in readers):
-        return None  # EPT points have no fixed numbers
     return sorted({name for step in before if step.ours for name in step.ours.creates()})
 
 
@@ -325,7 +325,7 @@ def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]
                 "pipelines/terrain-and-surface.json",
             )
     for step in readers:
-        for name in ("count", "start", "bounds", "polygon", "resolution"):
+        for name in _SELECTING.split():
             if name in step.options:
                 raise PipelineError(
                     f"option '{name}' of a reader cannot be combined with --tile",

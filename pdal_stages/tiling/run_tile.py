@@ -34,7 +34,7 @@ from ..stages.base import WHOLE_CLOUD, FarReaching, inside_block
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
 from ..stages.registry import stage_types
 from .checkpoint import load_arrays, save_arrays, written
-from .inputs import IndexedSource
+from .inputs import InputSource
 from .plan import INPUT, OUTSIDE, ROW, RunContext
 from .sorted_points import Piece, cut_all
 from .tile_grid import Box, TileGrid, inside
@@ -365,7 +365,7 @@ def run_tile(
     context: RunContext,
     number: int,
     tile: tuple[int, int],
-    sources: Sequence[IndexedSource],
+    sources: Sequence[InputSource],
     complete_m: float,
     target: str,
     outputs: list[str] | None = None,
@@ -379,7 +379,7 @@ def run_tile(
         Number of the round.
     tile : (int, int)
         Column and row in the grid of the round.
-    sources : sequence of IndexedSource
+    sources : sequence of InputSource
         All inputs within `complete_m` meters around the tile.
     complete_m : float
     target : str
@@ -411,7 +411,7 @@ def _run_with_halo(
     context: RunContext,
     number: int,
     tile: tuple[int, int],
-    sources: Sequence[IndexedSource],
+    sources: Sequence[InputSource],
     complete_m: float,
     folder: str,
 ) -> tuple[HeadResult, dict[str, Any]]:

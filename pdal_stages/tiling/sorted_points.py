@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import math
 import os
-import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +22,7 @@ from ..base.files import whole_files
 from ..base.grid import begins_run
 from ..pipeline.las_chunks import laspy_header, read_chunks
 from ..terrain.pieces import refuse_scattered
-from .inputs import CloudIndex, IndexedSource, InputSource, digest_of, fetch_ept
+from .inputs import CloudIndex, InputSource, digest_of
 from .tile_grid import Box, TileGrid, check_number
 
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, for which one piece need not wait
@@ -72,7 +71,7 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     dtype, cells = _copy_type(header), grid.scaled(1 / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     parts = [np.empty((0, 4), np.int64)]
-    total = checksum = 0
+    total = 0
     changed_ns, digest = os.stat(path).st_ctime_ns, digest_of(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
         for points in read_chunks(path, most=_PART):
@@ -87,14 +86,10 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
             rows = np.empty(len(records), dtype)
             rows["number"] = total + order
             rows["record"] = records[order]
-            data = rows.tobytes()
-            out.write(data)
-            checksum = zlib.crc32(data, checksum)
+            out.write(rows.tobytes())
             counts = np.diff([*starts, len(order)])
             parts.append(np.column_stack([column[starts], line[starts], total + starts, counts]))
             total += len(records)
-        out.flush()
-        os.fsync(out.fileno())  # before the record that calls the copy complete
         held = np.concatenate(parts)
         tiles = _squares(held, _CELLS)  # which cells divide exactly: powers of two do in floats
         check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
@@ -102,21 +97,8 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     box = [*low.tolist(), *high.tolist()]
     return {
         **{"count": total, "box": box, "tiles": tiles.tolist(), "cells": held.tolist()},
-        **{"grid": [cells.size, cells.origin], "changed_ns": changed_ns},
-        **{"digest": digest, "checksum": checksum},
+        **{"grid": [cells.size, cells.origin], "changed_ns": changed_ns, "digest": digest},
     }
-
-
-def is_intact(index: CloudIndex) -> bool:
-    """Return whether the sorted copy of a file holds the bytes that were written."""
-    checksum = 0
-    try:
-        with open(index.copy, "rb") as file:
-            while data := file.read(1 << 24):
-                checksum = zlib.crc32(data, checksum)
-    except OSError:
-        return False
-    return checksum == index.checksum
 
 
 def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
@@ -134,9 +116,10 @@ def coordinates(
     return x, y
 
 
-def points_near(path: str, index: CloudIndex, box: Box) -> tuple[NDArray[np.int64], NDArray]:
+def points_near(
+    header: laspy.LasHeader, index: CloudIndex, box: Box
+) -> tuple[NDArray[np.int64], NDArray]:
     """Return numbers (n,), ascending, and records (n,) of the points in a box, with its edges."""
-    header = laspy_header(path)
     (i0, j0), (i1, j1) = (
         index.grid.index(np.array(corner)).tolist() for corner in (box[:2], box[2:])
     )
@@ -183,7 +166,7 @@ class Piece:
 def cut_all(
     grid: TileGrid,
     tile: tuple[int, int],
-    sources: Sequence[IndexedSource],
+    sources: Sequence[InputSource],
     halo_units: float,
     folder: str,
 ) -> list[Piece]:
@@ -193,21 +176,12 @@ def cut_all(
     """
     box, inner = grid.box(tile, halo_units), grid.box(tile)
     pieces = []
-    for number, (source, index) in enumerate(sources):
-        path = source.path
-        if source.kind == "ept":
-            path = os.path.join(folder, f"fetched{number}.las")
-            if not fetch_ept(source, box, path):
-                continue
-            records = np.concatenate([points.array for points in read_chunks(path)])
-            numbers = np.arange(len(records))
-        elif index is not None:
-            numbers, records = points_near(path, index, box)
-        else:
-            continue
+    for number, source in enumerate(sources):
+        assert source.index is not None
+        header = laspy_header(source.path)
+        numbers, records = points_near(header, source.index, box)
         if not len(records):
             continue
-        header = laspy_header(path)
         x, y = coordinates(records, header)
         places = np.column_stack([grid.index(x), grid.index(y)])
         away = np.maximum(inner[0] - x, x - inner[2])

@@ -25,11 +25,11 @@ from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .checkpoint import Store, fingerprint
 from .inputs import CloudIndex, Survey
-from .jobs import InterruptedRun, Job, TiledRun, messages_of, messages_on_folders, summarize
+from .jobs import InterruptedRun, Job, TiledRun, messages_of, summarize
 from .options import TilingOptions, worker_bytes
 from .plan import RunContext, TilePlan, make_plan, outputs_for
 from .run_tile import block_name, blocks_near, make_block, run_tile, square_name
-from .sorted_points import TEMPORARY, is_intact, sort_points
+from .sorted_points import TEMPORARY, sort_points
 from .tile_grid import Box, TileGrid
 from .write_outputs import write_file
 
@@ -106,7 +106,7 @@ def run_plan(
     resumed = chosen.resume and chosen.tile is None
     known = Store(folder).note("run") if resumed else {}
     survey = Survey(plan, chosen, known if "square" in known else None)
-    if survey.per == "tile":  # whose outputs have points of all readers
+    if chosen.per == "tile":  # whose outputs have points of all readers
         files_with_flags_to_split([*plan.readers, *plan.tail])
     if pipeline is not None:
         _try_on_an_input(pipeline, survey, len(plan.readers))
@@ -128,8 +128,6 @@ def run_plan(
                 run = _Run(plan, survey, store, workers, progress)
                 run.read_inputs()
                 run.find_jobs()
-                files = [file for job in (*run.tiles, *run.outputs) for file in job.outputs or ()]
-                survey.messages += messages_on_folders(files, survey.paths, chosen.resume)
                 if chosen.resume:
                     run.take_over()
                     run.read_inputs(run.inputs_of_waiting())
@@ -161,10 +159,8 @@ def _workers(options: TilingOptions, folder: str) -> Any:
 def _try_on_an_input(pipeline: Pipeline, survey: Survey, readers: int) -> None:
     """Let PDAL prepare the pipeline on one input: what is wrong fails before any tile."""
     source = pipeline.source
-    inputs = [s for s in survey.sources if s.path not in survey.unreadable and s.kind == "las"]
-    if not inputs:
-        return
-    reader: dict[str, Any] = {**inputs[0].reader, "type": "readers.las", "filename": inputs[0].path}
+    inputs = survey.readable()
+    reader: dict[str, Any] = {**inputs[0].reader, "filename": inputs[0].path}
     tags = [stage.get("tag") for stage in source.stages[:readers]]
     stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
     with contextlib.suppress(DependencyError):  # the program pdal is not there to ask
@@ -205,7 +201,7 @@ class _Run:
             self.tiles, self.squares, self.messages_before, most
         )
         changed = survey.changed()
-        return TiledRun(self.tiles, self.outputs, survey.unreadable, changed, messages, summary)
+        return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
 
     def _do(
         self, what: str, waiting: deque[Job], task_of: Callable[[Job], Callable[[], Any]]
@@ -247,44 +243,45 @@ class _Run:
 
     # ---- inputs ----------------------------------------------------------------------------------
 
-    def read_inputs(self, needed: Collection[str] | None = None) -> None:
-        """Read LAS and LAZ files once, sort their points by location, and save their index.
+    def read_inputs(self, needed: Collection[str] = ()) -> None:
+        """Read files once, sort their points by location, and save their index.
 
         Files that an earlier run read are read again where they changed, or where their points are
-        `needed` (paths) and the copy of these is gone or damaged.
+        `needed` (paths).
         """
         survey, store = self.survey, self.store
         waiting: deque[Job] = deque()
-        for source in survey.sources:
-            if source.kind != "las" or source.path in survey.unreadable:
+        for source in survey.readable():
+            if source.index and (source.index.copy or source.path not in needed):
                 continue
             name = fingerprint(source.path, vars(survey.grid))
-            copy = store.path(name, ".points")
             # Without a valid record it is read again.
             with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
-                index = CloudIndex.parse(store.note(name), copy)
-                wanted = source.path in (needed or ())
-                known = source.path in survey.indexes or index.is_of(source.path)
-                if known and (not wanted or is_intact(index)):
-                    survey.indexes[source.path] = index
+                index = CloudIndex.parse(store.note(name))
+                if source.path not in needed and index.is_of(source.path):
+                    source.index = index
                     continue
-            waiting.append(Job(name, survey.extents[source.path].count, source=source, target=copy))
+            assert source.extent is not None
+            waiting.append(Job(name, source.extent.count, source=source))
+
+        def copy_of(job: Job) -> str:
+            return str(store.scratch / f"{job.name}.points")
 
         def task_of(job: Job) -> Callable[[], Any]:
             assert job.source is not None
-            return partial(sort_points, job.source.path, survey.grid, job.target)
+            return partial(sort_points, job.source.path, survey.grid, copy_of(job))
 
         for job in self._do("reading the inputs", waiting, task_of):
             assert job.source is not None
-            path = job.source.path
             if f"the {TEMPORARY} file" in job.reason:  # the input is not the cause
                 raise StageError(job.reason)
-            if job.reason:
-                survey.unreadable[path] = job.reason
-                continue
-            index = survey.indexes[path] = CloudIndex.parse(job.record, job.target)
-            if index.count and (odd := las_check.beyond_box(path, index.box)):
-                survey.messages.append(odd)
+            job.source.fault = job.reason
+            if not job.reason:
+                job.source.index = index = CloudIndex.parse(job.record, copy_of(job))
+                if index.count:
+                    survey.messages += filter(
+                        None, [las_check.beyond_box(job.source.path, index.box)]
+                    )
         survey.place()
 
     def inputs_of_waiting(self) -> set[str]:
@@ -305,23 +302,23 @@ class _Run:
         """
         plan, survey, grid = self.plan, self.survey, self.survey.grid
         sees = plan.sees_m / survey.unit
-        tail = [plan.tail, plan.extra_dims, survey.stamps_of(plan.tail)]
+        head_end, per_tile = len(plan.head), survey.options.per == "tile"
+        tail = [plan.tail, plan.extra_dims, survey.stamps_of(plan.files[head_end:])]
         common = fingerprint(
             build(),
-            [plan.head, survey.stamps_of(plan.head), plan.creates, plan.halo_m, sees],
+            [plan.head, survey.stamps_of(plan.files[:head_end]), plan.creates, plan.halo_m, sees],
             [vars(grid), survey.options.most_points],
-            tail if survey.per == "tile" else [],
+            tail if per_tile else [],
         )
         for tile, points in survey.tiles().items():
             job = Job(grid.name(tile), points, tile)
-            job.mark = fingerprint(
-                common, tile, survey.seen(survey.near(tile, max(sees, self.farthest)))
-            )
-            if bad := [s.path for s in survey.near(tile, sees) if s.path in survey.unreadable]:
-                job.fail(f"an input here cannot be read: {bad[0]}", bad[0])
+            near = survey.near(tile, max(sees, self.farthest))
+            job.mark = fingerprint(common, tile, [source.content for source in near])
+            if bad := [source.path for source in survey.near(tile, sees) if source.fault]:
+                job.fail(f"an input here cannot be read: {bad[0]}", blocked=True)
             self.tiles.append(job)
         self.plan = plan.adapt(len(self.tiles), survey.tiles_per_square)
-        if survey.per == "tile":
+        if per_tile:
             named = outputs_for(plan, survey.paths, [job.name for job in self.tiles])
             for job, paths in zip(self.tiles, named, strict=True):
                 job.outputs = paths
@@ -329,13 +326,11 @@ class _Run:
         by_tile = {job.tile: job for job in self.tiles}
         for source, paths in zip(survey.sources, survey.outputs, strict=True):
             out = Job(f"file-{source.key}", source=source, outputs=paths)
-            if index := survey.indexes.get(source.path):
+            if index := source.index:
                 out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
-            out.mark = fingerprint(
-                survey.seen([source]), tail, [job.mark for job in out.jobs], paths
-            )
-            if source.path in survey.unreadable:
-                out.fail(f"its input cannot be read: {source.path}", source.path)
+            out.mark = fingerprint(source.content, tail, [job.mark for job in out.jobs], paths)
+            if source.fault:
+                out.fail(f"its input cannot be read: {source.path}", blocked=True)
             self.outputs.append(out)
 
     def take_over(self) -> None:
@@ -390,7 +385,7 @@ class _Run:
             results = [store.path(each.name) for each in job.jobs]
             assert job.outputs is not None
             plan, scratch = context.plan, context.scratch
-            return partial(write_file, plan, job.source, job.points, results, job.outputs, scratch)
+            return partial(write_file, plan, job.source, results, job.outputs, scratch)
 
         for job in self._do("tiles", waiting, task_of):
             written = job.state == "done" and job.outputs and job.record["outputs"]
@@ -406,9 +401,9 @@ class _Run:
         sources = survey.near_box(box)
         complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
         target = self.store.path(job.name)
-        indexed = survey.readable(sources)
+        readable = [source for source in sources if not source.fault]
         return partial(
-            run_tile, self._context, number, job.tile, indexed, complete, target, job.outputs
+            run_tile, self._context, number, job.tile, readable, complete, target, job.outputs
         )
 
     def forget(self) -> None:
@@ -420,7 +415,6 @@ class _Run:
             for pattern in ("*.block.npz", "*.round*.npz"):
                 needed |= {path.name for path in self.store.kept.glob(pattern)}
         self.store.remove(".npz", needed)
-        self.store.remove(".points")
 
     # ---- rounds before the last ------------------------------------------------------------------
 
@@ -513,9 +507,9 @@ class _Run:
         far = max(self.plan.sees_m / survey.unit if number else 0.0, self.farthest)
         box = survey.squares.box(square, far)
         mark = fingerprint(
-            [build(), head, survey.stamps_of(head), survey.layout, survey.unit, vars(part)],
-            square,
-            survey.seen([s for s in survey.near_box(box) if s.path not in survey.unreadable]),
+            [build(), head, survey.stamps_of(self.plan.files[: len(head)])],
+            [survey.layout, survey.unit, vars(part), square],
+            [source.content for source in survey.near_box(box) if not source.fault],
         )
         name = square_name(self._context, number, square)
         return Job(name, self._points_of_squares[square], square, mark=mark)
@@ -542,7 +536,7 @@ def _make_ready(out: Job, waiting: deque[Job]) -> None:
     failed = [job for job in out.jobs if job.state == "failed"]
     if failed:
         others = f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""
-        blocked = failed[0].blocked_by if all(job.blocked_by for job in failed) else ""
+        blocked = all(job.blocked for job in failed)
         out.fail(f"tile {failed[0].name} failed{others}", blocked)
     else:
         out.state = "ready"
@@ -553,7 +547,7 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     """Estimate a run from the headers of inputs: tiles, points, memory and disk (``--dry-run``)."""
     grid, options, density = survey.grid, survey.options, survey.density
     tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
-    if survey.per == "tile":
+    if options.per == "tile":
         outputs_for(plan, survey.paths, [job.name for job in tiles])
     count, read = density.points, density.read_by(grid.size, survey.halo_units)
     kept = float(count * _KEPT)
@@ -561,7 +555,7 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         cells = density.area * (survey.unit / plan.blocks.cell) ** 2
         kept += count * _KEPT_BEFORE + cells * _KEPT_OF_CELL
     kept += sum(count * _KEPT for part in plan.rounds if part.kept and part.blocks is None)
-    largest = density.largest if survey.per == "file" else 0
+    largest = density.largest if options.per == "file" else 0
     summary = survey.figures(plan) | {
         "workers": options.local_workers,
         "threads_per_worker": options.threads,
@@ -571,4 +565,4 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "disk_gb": kept / 1e9,
         "states": {"waiting": len(tiles)},
     }
-    return TiledRun(tiles, [], survey.unreadable, [], survey.messages, summary)
+    return TiledRun(tiles, [], survey.faults, [], survey.messages, summary)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -24,7 +25,7 @@ from ..classifier.training_options import TrainingOptions
 from ..pipeline import las_output
 from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import stage_files
-from ..pipeline.inputs_outputs import is_ept, is_las
+from ..pipeline.inputs_outputs import is_las
 from ..pipeline.json_source import Override, overridden
 from ..pipeline.pdal import reader_of
 from ..pipeline.run import Pipeline
@@ -36,9 +37,9 @@ from ..stages.preprocessing import preparation_of
 from ..stages.registry import stage_from
 from ..stages.train_model import TrainModel
 from .checkpoint import load_arrays, save_arrays, written
-from .inputs import find_sources, read_extent
+from .inputs import las_extent
 from .options import TilingOptions, fits_whole
-from .plan import plan_of_files, readers_of
+from .plan import plan_of_files
 from .tiled_run import run_plan
 from .write_outputs import NewValues, PieceResults, of_own_points, read_with
 
@@ -141,10 +142,6 @@ class TrainTask:
             for name, files in self.surveys.items()
         ] or [self]
 
-    def _points(self) -> int:
-        """Return the number of points of the files, from their headers."""
-        return sum(read_extent(source).count for source in find_sources(readers_of(self.files)))
-
     @cached_property
     def stage(self) -> TrainModel:
         """Return the stage that trains."""
@@ -155,15 +152,16 @@ class TrainTask:
 
         False where the user wants tiles.
         """
-        can_be_cut = all(is_las(name) or is_ept(name) for name in self.files)
-        if not can_be_cut or self.stage.algorithm != "random_forest":
+        if not all(map(is_las, self.files)) or self.stage.algorithm != "random_forest":
             return True
         if self.options.tile is not None:
             return False
         try:
             return all(
-                fits_whole(task._points(), self.options.memory, TRAIN_POINT)
-                for task in self._each()
+                fits_whole(
+                    sum(las_extent(f).count for f in files), self.options.memory, TRAIN_POINT
+                )
+                for files in (task.files for task in self._each())
             )
         except StageError:
             return True  # reading it reports the error
@@ -273,7 +271,7 @@ class TrainTask:
         numbers: dict[str, int] = {}
         if self.stage.groups == FILE_NUMBER:
             for number, name in enumerate(self.files, 1):
-                numbers[find_sources(readers_of([name]))[0].path] = number
+                numbers[os.path.abspath(name)] = number
         plan = replace(plan, takes=partial(take_points, self._writer, numbers), name=self.model)
         run = run_plan(plan, replace(self.options, per="tile"))
         if run.failures:

@@ -269,15 +269,16 @@ def with_dimensions(
 def write_file(
     plan: TilePlan,
     source: InputSource,
-    count: int,
     results: list[str],
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Write the outputs of a file of `count` points from the results of its tiles.
+    """Write the outputs of a file from the results of its tiles; return the record.
 
-    Return the record, with class counts.
+    It has class counts.
     """
+    assert source.index is not None
+    count = source.index.count
     tail = with_dimensions(plan.tail, plan.extra_dims, [source.path])
     writer, names = plan.writers[0], [Path(path).suffix.lower() for path in outputs]
     plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())

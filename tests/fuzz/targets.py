@@ -28,6 +28,7 @@ from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_repair import extra_dimensions
+from pdal_stages.base.octree_check import check_ept
 from pdal_stages.classifier import model_file
 from pdal_stages.classifier.interface import classifier_of
 from pdal_stages.classifier.model import assemble
@@ -174,9 +175,8 @@ def ept(data: bytes) -> str:
     path = put("ept.json", data)
     path.with_name("ept-hierarchy").mkdir(exist_ok=True)
     (path.with_name("ept-hierarchy") / "0-0-0-0.json").write_text('{"0-0-0-0": 0}')
-    extent = inputs.read_extent(inputs.InputSource(str(path), {"type": "readers.ept"}, "ept"))
-    assert extent.count >= 0 and np.isfinite(extent.box).all()
-    TileGrid(10.0).covering(extent.box)
+    described = check_ept(str(path))
+    assert int(described["points"]) >= 0 and np.isfinite(described["boundsConforming"]).all()
     return "read"
 
 

@@ -59,6 +59,6 @@ LISTS = {
 def test_lists_of_files(command, tmp_path, case):
     name, content, says = LISTS[case]
     (tmp_path / name).write_bytes(content)
-    kind = "readers.ept" if name == "ept.json" else "readers.tindex"
+    kind, tiles = ("readers.ept", []) if name == "ept.json" else ("readers.tindex", TILES)
     read = {"type": kind, "filename": str(tmp_path / name)}
-    command.refused(["pipeline", job(tmp_path, read, HAG, tmp_path / "o_#.las"), *TILES], *says)
+    command.refused(["pipeline", job(tmp_path, read, HAG, tmp_path / "o_#.las"), *tiles], *says)
