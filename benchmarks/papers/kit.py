@@ -221,7 +221,7 @@ def predict(
     forest, values: np.ndarray, classes: Sequence[int], low=None, high=None, chunk: int = 65_536
 ):
     """Class codes of rows, chunk by chunk (they may lie in a file)."""
-    ours = Forest.from_sklearn([tree.tree_ for tree in forest.estimators_], values.shape[1])
+    ours = Forest.from_sklearn(forest.estimators_, values.shape[1])
     codes = np.asarray(forest.classes_)
     assert set(codes.tolist()) <= set(classes)
     result = np.empty(len(values), codes.dtype)

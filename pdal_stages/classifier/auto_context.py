@@ -236,9 +236,8 @@ class _StepOnBand:
     context: CellContext | None  #: of the band and the strips beside it
     strips: Strips
     first_place: int  #: of the points of `context`, among the strips
-    mask: (
-        npt.NDArray[np.bool_] | None
-    )  #: of rows in the request's cloud: those that the step must look at; None: all
+    #: of rows in the request's cloud: those that the step must look at; None: all
+    mask: npt.NDArray[np.bool_] | None
     run: Run | None = None  #: that computes the features
     keep: bool = False  #: whether a later step needs the features
 
@@ -315,9 +314,8 @@ class Strips:
         """Sort the rows by strip."""
         number = cell_numbers(xyz[:, 1] if rows is None else xyz[rows, 1], width)
         self._order: npt.NDArray[np.int64] | None = None
-        if (
-            rows is not None or (number[1:] < number[:-1]).any()
-        ):  # else they follow each other already
+        # Else they follow each other already.
+        if rows is not None or (number[1:] < number[:-1]).any():
             order = np.argsort(number, kind="stable")
             number = number[order]
             self._order = order if rows is None else rows[order]

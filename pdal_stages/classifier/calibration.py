@@ -34,9 +34,8 @@ class ClassLimit(NamedTuple):
 
     reliability: float  #: :data:`UNREACHABLE` where no reliability gives the accuracy wanted
     kept: float  #: share of the class's points that keep it
-    accuracy: (
-        float  #: share of these that are right; where none keeps it, the largest share there is
-    )
+    #: share of these that are right; where none keeps it, the largest share there is
+    accuracy: float
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,8 @@ class Context:
     OptionError for an unknown token.
     """
 
-    tokens: tuple[
-        str, ...
-    ]  #: ``own``, a word of :data:`CELLS` and a side (``box1``, ``columnvotes8``), or ``segments6``
+    #: ``own``, a word of :data:`CELLS` and a side (``box1``, ``columnvotes8``), or ``segments6``
+    tokens: tuple[str, ...]
 
     def __post_init__(self) -> None:
         """Raise an OptionError for an unknown token."""
@@ -67,22 +66,18 @@ class Context:
         """Side of the cells, axes, and whether votes are read, by token that has cells."""
         scales = {}
         for token in self.tokens:
+            if token == OWN or token in self.segment_codes:
+                continue
             match = re.fullmatch(rf"({'|'.join(CELLS)})(\d+(?:\.\d+)?)", token)
-            if (
-                token != OWN
-                and token not in self.segment_codes
-                and (match is None or float(match[2]) not in SIDES)
-            ):
+            if match is None or float(match[2]) not in SIDES:
                 raise OptionError(
                     "a token of 'context' is not known",
                     found=repr(token)[:60],
                     cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in meters that is a power "
-                    "of two "
-                    f"from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8; or {SEGMENTS} and the "
-                    "code of a class",
+                    f"of two from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8; or {SEGMENTS} and "
+                    "the code of a class",
                 )
-            if match:
-                scales[token] = (float(match[2]), *CELLS[match[1]])
+            scales[token] = (float(match[2]), *CELLS[match[1]])
         return scales
 
     @cached_property
@@ -140,7 +135,7 @@ class Context:
             Heights above ground in meters; only segments need them.
         """
         jobs = [(xyz[:, :axes], shares, side, votes) for side, axes, votes in self.scales.values()]
-        means = map_blocks(_cell_means, jobs, threads)
+        means = map_blocks(lambda job: cell_means(*job), jobs, threads)
         segments = {}
         for token, code in self.segment_codes.items():
             assert height is not None
@@ -198,11 +193,6 @@ class CellContext:
                 cell, mean = self.cells[token]
                 parts.append(mean[cell[rows]])
         return np.concatenate(parts, axis=1, dtype=np.float32)
-
-
-def _cell_means(job: tuple[Any, ...]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Call :func:`cell_means` in a worker thread."""
-    return cell_means(*job)
 
 
 def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:

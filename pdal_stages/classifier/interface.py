@@ -54,9 +54,8 @@ class PredictRequest:
     progress: Any = None  #: its ``update`` is called with the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
     device: str = "cpu"  #: where a network is applied
-    report: Report = field(
-        default_factory=Report
-    )  #: what is counted, complete when all blocks are read
+    #: what is counted, complete when all blocks are read
+    report: Report = field(default_factory=Report)
 
     @property
     def count(self) -> int:

@@ -218,29 +218,15 @@ class Model:
         columns = empty_columns(roles, len(self.classes), how)
         values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.present)
         representatives = represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
-        del values
         if representatives is not None:  # the coordinates of the others are not needed any more
             xyz = xyz[representatives.rows]
-        features = self.passes[0].features
-        cell = 1.0 if features is None else features.plan.cell
+        cell = getattr(self.passes[0].plan, "cell", 1.0)
         work = WorkingCloud.sort(xyz, cell, representatives, roles.wanted_rows)
-        del xyz
-        names = (*self.required_dimensions, *self.optional_dimensions)
-        request = PredictRequest(
-            work.xyz,
-            work.take(names, dimensions),
-            work.wanted,
-            how.threads,
-            how.memory_mb,
-            None if work.stands_for_others else progress,
-            work.grid,
-            how.device,
-        )
-        del dimensions
+        del xyz, values
+        request = self._request(work, dimensions, how, progress)
         self._classify(work, request, columns, progress)
         if roles.not_ground is not None:
-            moved = move_from_ground(columns, roles)
-            request.report.figures["too_far_for_ground"] = moved
+            request.report.figures["too_far_for_ground"] = move_from_ground(columns, roles)
         if len(work.xyz) < len(roles.wanted) - roles.ignored:
             request.report.figures["representatives"] = len(work.xyz)
         rejected = reject(columns, roles, how)
@@ -265,6 +251,26 @@ class Model:
             self.preparation, xyz, roles.usable, threads, roles.current
         )
         return dimensions if computed.keys() & dimensions.keys() else {**computed, **dimensions}
+
+    def _request(
+        self,
+        work: WorkingCloud,
+        dimensions: Mapping[str, npt.ArrayLike],
+        how: PredictionOptions,
+        progress: Any,
+    ) -> PredictRequest:
+        """Return the request for the points in work."""
+        names = (*self.required_dimensions, *self.optional_dimensions)
+        return PredictRequest(
+            work.xyz,
+            work.take(names, dimensions),
+            work.wanted,
+            how.threads,
+            how.memory_mb,
+            None if work.stands_for_others else progress,
+            work.grid,
+            how.device,
+        )
 
     def _classify(
         self,

@@ -71,9 +71,8 @@ def _passes(model: Model) -> _Rows:
         rows.append((f"pass {number + 1}", text))
         if entry["importances"] is not None:
             largest = list(model.importances(number).items())[:_TOP]
-            rows.append(
-                ("", f"importances {', '.join(f'{k} {_percent(share)}' for k, share in largest)}")
-            )
+            shares = ", ".join(f"{name} {_percent(share)}" for name, share in largest)
+            rows.append(("", f"importances {shares}"))
     return rows
 
 
@@ -81,12 +80,11 @@ def _training(model: Model) -> _Rows:
     """Return what it was trained on and where it holds."""
     info = model.info
     clouds = info["training"]["clouds"]
-    heads = [cloud["name"].partition(", ")[0] for cloud in clouds]  # copies follow the comma
-    pairs = zip(clouds, heads, strict=True)
-    named = (cloud["name"] if heads.count(head) == 1 else head for cloud, head in pairs)
-    surveys = list(dict.fromkeys(named))
-    more = f" and {len(surveys) - _SURVEYS} more (--showjson lists them)"
-    names = ", ".join(surveys[:_SURVEYS]) + more * (len(surveys) > _SURVEYS)
+    surveys: list[str] = []  # the names of copies begin with that of their survey
+    for cloud in clouds:
+        if not any(cloud["name"].startswith((f"{name} ", f"{name},")) for name in surveys):
+            surveys.append(cloud["name"])
+    names = ", ".join(surveys[:_SURVEYS]) + " ..." * (len(surveys) > _SURVEYS)
     points = sum(cloud["points"] for cloud in clouds)
     size = f"{len(surveys)} surveys or files, {len(clouds)} clouds with copies, {points:,} points"
     rows = [("trained on", size), ("", names)]

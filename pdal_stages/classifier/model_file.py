@@ -54,7 +54,7 @@ CURE = "Train the model again, or copy the file again if it was damaged on its w
 #: Errors that zipfile, zlib and NumPy raise for damaged files.
 _BAD = (
     *(zlib.error, struct.error, EOFError, OSError, MemoryError, NotImplementedError, RuntimeError),
-    *(ValueError, KeyError, OverflowError),
+    *(ValueError, KeyError, OverflowError, zipfile.BadZipFile),
 )
 
 
@@ -139,19 +139,13 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
             raise ModelError(what, cure="Check the path")
         with zipfile.ZipFile(path) as archive:
             return _read(archive, path.stat().st_size, rules_of, path in shipped().values())
-    except zipfile.BadZipFile as error:
-        raise ModelError(
-            "this is not a model file, or it is cut short or damaged",
-            where=str(path),
-            found=str(error)[:200],
-            cure=CURE,
-        ) from None
     except StageError as error:
         error.cure = error.cure or CURE
         raise error.at(str(path)) from error.__cause__
     except _BAD as error:  # RecursionError is a RuntimeError
+        what = "this is not a model file, or it is cut short or damaged"
         text = f"{type(error).__name__}: {error}"[:200]
-        raise ModelError("the file is damaged", where=str(path), found=text, cure=CURE) from error
+        raise ModelError(what, where=str(path), found=text, cure=CURE) from error
 
 
 def _read(
@@ -199,9 +193,8 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     if info.flag_bits & 0x1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ModelError("a member has an unsupported compression", found=repr(info.filename))
     with archive.open(info) as stream:
-        data = stream.read(
-            info.file_size + 1
-        )  # never more than was declared; the CRC is checked at the end
+        # Never more than was declared; the CRC is checked at the end.
+        data = stream.read(info.file_size + 1)
         if len(data) != info.file_size or stream.read(1):
             raise ModelError("a member has another size than declared", found=repr(info.filename))
     return data
@@ -210,9 +203,8 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 def to_bytes(array: npt.NDArray[Any]) -> bytes:
     """Return the array as ``.npy`` bytes (version 1.0, little-endian, C order)."""
     out = io.BytesIO()
-    np.save(
-        out, array.astype(array.dtype.newbyteorder("<"), order="C", copy=False), allow_pickle=False
-    )
+    little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False)
+    np.save(out, little, allow_pickle=False)
     return out.getvalue()
 
 
@@ -230,10 +222,7 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
         if any(type(n) is not int for n in shape):  # True is one to NumPy
             raise ValueError(f"shape {shape}")
         if fortran or dtype.str not in rule.dtypes or len(shape) != rule.ndim:
-            raise ValueError(
-                f"{dtype.str} {shape}, not {' or '.join(rule.dtypes)} with {rule.ndim} axes in C "
-                "order"
-            )
+            raise ValueError(f"{dtype.str} {shape}, not {rule} in C order")
         rest = len(data) - stream.tell()
         if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != rest:
             raise ValueError(f"{rest:,} bytes of values for shape {shape}")

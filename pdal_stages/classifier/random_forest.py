@@ -8,8 +8,9 @@ docs/model-file.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -101,10 +102,10 @@ class Forest:
     def from_sklearn(cls, trees: Sequence[Any], n_features: int) -> Forest:
         """Convert fitted scikit-learn trees.
 
-        `trees` are DecisionTreeClassifiers or their ``tree_``, trained on float32 features with
-        whole-number sample weights (bootstrap counts) and one output.
+        `trees` are DecisionTreeClassifiers, trained on float32 features with whole-number sample
+        weights (bootstrap counts) and one output.
         """
-        parts = [_level_order(getattr(tree, "tree_", tree)) for tree in trees]
+        parts = [_level_order(tree.tree_) for tree in trees]
         kind = np.int16 if n_features <= np.iinfo(np.int16).max else np.int32
         return cls(
             np.array([len(part[0]) for part in parts], np.int32),
@@ -273,7 +274,7 @@ def grow_forest(
     Forest, (features,) float64
         The forest, and the features' importances, which sum to 1, or to 0.
     """
-    grow = _tree_grower(values, label, weight, growth)
+    grow = partial(_grow_tree, values, label, weight, growth)
     counts = [trees] if isinstance(trees, int) else sorted(trees)
     grown: list[Any] = []
     accuracy: dict[int, float] = {}  # out of the bag, by number of trees
@@ -289,42 +290,35 @@ def grow_forest(
     if accuracy:
         grown = grown[: max(accuracy, key=lambda number: (accuracy[number], -number))]
     importances = np.sum([tree.feature_importances_ for tree in grown], axis=0)
-    forest = Forest.from_sklearn([tree.tree_ for tree in grown], values.shape[1])
+    forest = Forest.from_sklearn(grown, values.shape[1])
     if growth.vote == "majority":
         forest = replace(forest, leaf_counts=_give_to_winners(forest.leaf_counts))
     return forest, importances / (importances.sum() or 1.0)
 
 
-def _tree_grower(
+def _grow_tree(
     values: npt.NDArray[np.float32],
     label: npt.NDArray[Any],
     weight: npt.NDArray[np.int64],
     growth: TrainingOptions,
-) -> Callable[[int], tuple[Any, npt.NDArray[np.bool_]]]:
-    """Return the function that grows a tree by its number; see :func:`grow_forest`."""
+    number: int,
+) -> tuple[Any, npt.NDArray[np.bool_]]:
+    """Return a tree by its number, and which samples (n,) are out of its bag."""
     from sklearn.tree import DecisionTreeClassifier
 
-    features = values.shape[1]
-    root = max(1, math.isqrt(features))
-    options = {
-        "max_features": root if growth.max_features == "sqrt" else max(root, features // 10),
-        "max_depth": root if growth.max_depth == "sqrt" else None,
-        "min_samples_leaf": growth.min_samples_leaf,
-    }
-    ends = np.cumsum(weight)
+    root, ends = max(1, math.isqrt(values.shape[1])), np.cumsum(weight)
     draws = max(1, round((growth.max_samples or 1.0) * int(ends[-1])))
-
-    def grow(number: int) -> tuple[Any, npt.NDArray[np.bool_]]:
-        """Return a tree, and which samples (n,) are out of its bag."""
-        random = np.random.default_rng([growth.seed, number])
-        drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
-        bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
-        seed = int(random.integers(0, 2**31 - 1))
-        tree = DecisionTreeClassifier(random_state=seed, **options)
-        tree.fit(values, label, sample_weight=bag, check_input=False)
-        return tree, (bag == 0) & (weight > 0)
-
-    return grow
+    random = np.random.default_rng([growth.seed, number])
+    drawn = np.searchsorted(ends, random.integers(0, ends[-1], draws), side="right")
+    bag = np.bincount(drawn, minlength=len(weight)).astype(np.float64)
+    tree = DecisionTreeClassifier(
+        random_state=int(random.integers(0, 2**31 - 1)),
+        max_features=root if growth.max_features == "sqrt" else max(root, values.shape[1] // 10),
+        max_depth=root if growth.max_depth == "sqrt" else None,
+        min_samples_leaf=growth.min_samples_leaf,
+    )
+    tree.fit(values, label, sample_weight=bag, check_input=False)
+    return tree, (bag == 0) & (weight > 0)
 
 
 def _share_right(

@@ -72,21 +72,28 @@ def train(
             cloud = replace(cloud, dimensions=computed)
         sources = [cloud]
     with tempfile.TemporaryDirectory(prefix="pdal-stages-") as temporary:
-        prepared_clouds: Iterable[TrainingCloud] = prepared(sources, options)
-        if not isinstance(sources, list | tuple):
-            prepared_clouds = spooled(prepared_clouds, folder or Path(temporary))
-        usable_clouds = [cloud for cloud in prepared_clouds if cloud.points]
-        if not usable_clouds:
-            left_out = ", ".join(map(str, options.ignore))
-            raise OptionError(
-                "there are no points to train on",
-                cure=f"Give some; those of labels {left_out} are left out ('ignore') unless "
-                "'classes' names them",
-            )
+        usable_clouds = _usable_clouds(sources, options, folder or Path(temporary))
         model = trainer_of(options.algorithm).train(usable_clouds, options, progress)
     if options.base is None:
         model.record_preprocessing(preparation)
     return model
+
+
+def _usable_clouds(
+    sources: Iterable[TrainingCloud], options: TrainingOptions, folder: Path
+) -> list[TrainingCloud]:
+    """Return the clouds without ignored points; those of an iterator are kept in files."""
+    clouds: Iterable[TrainingCloud] = prepared(sources, options)
+    if not isinstance(sources, list | tuple):
+        clouds = spooled(clouds, folder)
+    if usable := [cloud for cloud in clouds if cloud.points]:
+        return usable
+    left_out = ", ".join(map(str, options.ignore))
+    raise OptionError(
+        "there are no points to train on",
+        cure=f"Give some; those of labels {left_out} are left out ('ignore') unless 'classes' "
+        "names them",
+    )
 
 
 def reach(options: TrainingOptions) -> float:
