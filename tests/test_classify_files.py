@@ -89,8 +89,7 @@ def test_the_output_folder_is_made(folder, classify, tmp_path, given, output, na
 @pytest.mark.parametrize("words", [["--filters.modelclassifier.no=1"], ["--where", "No > 1"]])
 @pytest.mark.parametrize("how", [[], ["--tile", 5]])
 def test_what_is_refused_leaves_no_folder(folder, classify, tmp_path, words, how):
-    objects = ("--objects", f"{tmp_path}/a/b/o.gpkg")
-    code, _, err = classify(folder / "in/t0.laz", f"{tmp_path}/a/b", *objects, *words, *how)
+    code, _, err = classify(folder / "in/t0.laz", f"{tmp_path}/a/b", *words, *how)
     assert code == 1 and ("no option 'no'" in err or "dimension 'No'" in err), err
     assert not list(tmp_path.iterdir())
 
@@ -132,7 +131,7 @@ def test_a_suffix_that_pdal_does_not_know(folder, classify, tmp_path):
     code, _, err = classify(folder / "in/t0.laz", tmp_path / "out.lax")
     assert code == 1 and "out.lax" in err and "Is the suffix mistyped (.laz, .las)?" in err
     code, _, err = classify(folder / "in/t0.laz", tmp_path / "out.tif")
-    assert code == 1 and "classify writes points" in err and "--objects FILE" in err
+    assert code == 1 and "classify writes points" in err and "pdal-stages objects" in err
 
 
 def test_metadata_of_many(folder, classify, tmp_path):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import sys
 
 import laspy
 import pytest
 from block_scene import ground_and_block
-from processes import ended, python
+from processes import python
 
 from pdal_stages.cli import main
 from pdal_stages.cli.parser import COMMANDS, parse
@@ -165,22 +164,3 @@ def test_no_command_shows_the_help(capsys):
             main(words)
         shown.append((ended.value.code, capsys.readouterr().out))
     assert shown[0] == shown[1] and "classify" in shown[0][1]
-
-
-@pytest.mark.skipif(
-    not hasattr(os, "fork"), reason="nothing watches where processes cannot be forked"
-)
-@pytest.mark.parametrize(
-    ("kill", "number", "said"),
-    [("kill(os.getpid()", 9, "died in"), ("killpg(0", 2, "interrupted; ")],
-)
-def test_a_process_that_dies_is_told_of(cloud, tmp_path, kill, number, said):
-    """By a process beside it: a crash in PDAL and a lack of memory leave Python no time for a message."""
-    ends = f"import os, signal\ndef f(ins, outs):\n    signal.signal(2, signal.SIG_DFL)\n    os.{kill}, {number})\n"
-    how = {"type": "filters.python", "source": ends, "function": "f", "module": "ends"}
-    (tmp_path / "dies.json").write_text(json.dumps([str(cloud), how, str(tmp_path / "out.las")]))
-    words = [sys.executable, "-m", "pdal_stages.cli", "pipeline", tmp_path / "dies.json"]
-    done = ended(*words, start_new_session=True)
-    assert done.returncode == -number
-    assert said in done.stderr
-    assert not (tmp_path / "out.las").exists()

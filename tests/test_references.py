@@ -288,7 +288,7 @@ def test_outputs_of_tiles_keep_the_units_of_their_inputs(tmp_path, write_las):
 
 
 def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, write_las):
-    """Feet across, meters up: by `objects`, `writers.objects`, and of what `classify --objects` writes."""
+    """Feet across, meters up: by `objects` and by `writers.objects`, also of classified files."""
     pyogrio = pytest.importorskip("pyogrio")
     town = ps.make_town(60.0, 9.0, seed=4, progress=False)
     path = tmp_path / "town.las"
@@ -319,7 +319,7 @@ def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, wri
     same((crs, columns), buildings("b.gpkg"))
     assert 3 < columns["h_ridge"].max() < np.ptp(z)
     out = tmp_path / "out.las"
-    assert run("classify", path, out, "--objects", tmp_path / "c.gpkg")[0] == 0
+    assert run("classify", path, out)[0] == run("objects", out, tmp_path / "c.gpkg")[0] == 0
     by_stage(out, "d.gpkg")
     same(buildings("c.gpkg"), buildings("d.gpkg"))
     written = laspy.read(out)

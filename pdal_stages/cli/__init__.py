@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import faulthandler
 import gc
 import itertools
 import os
@@ -14,10 +15,7 @@ from typing import Any
 from ..base.errors import StageError
 from ..base.messages import PlainStream, print_messages
 from .parser import parse
-from .signals import INTERRUPTED, watch_for_crash
 
-#: Under this limit on addresses, in bytes, libraries crash or wait forever for threads.
-_LEAST_MEMORY = 2**30
 #: Imports alone create so many objects that Python would collect garbage over and over.
 _OBJECTS_BETWEEN_COLLECTIONS = 300_000
 
@@ -28,7 +26,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in arguments or os.environ.get("PDAL_STAGES_DEBUG", "") not in ("", "0")
     arguments = [word for word in arguments if word != "--debug"]
     is_program = argv is None
-    end_watching = watch_for_crash(arguments) if is_program else lambda: None
     if is_program:
         _tune_process()
     streams = sys.stdout, sys.stderr
@@ -41,7 +38,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stdout, sys.stderr = map(PlainStream, streams)  # type: ignore[assignment]
     progress_before = os.environ.get("PDAL_STAGES_PROGRESS")
     try:
-        _refuse_little_memory()
         options = parse(arguments, is_program)
         if getattr(options, "progress", None) is not None:
             os.environ["PDAL_STAGES_PROGRESS"] = str(int(options.progress))
@@ -52,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
     except KeyboardInterrupt:
-        print_messages(INTERRUPTED)
+        print_messages("interrupted; no partial output was left")
         return 130
     except Exception as error:
         if debug:
@@ -60,7 +56,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_messages(str(error if isinstance(error, StageError) else _explain(error)))
         return 1
     finally:
-        end_watching()
         sys.stdout, sys.stderr = streams
         os.environ.pop("PDAL_STAGES_PROGRESS", None)
         if progress_before is not None:
@@ -69,6 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _tune_process() -> None:
     """Set up a process that runs for one command alone."""
+    faulthandler.enable()  # a crash inside PDAL, as of damaged COPC points, tells where it was
     # OpenBLAS's threads spin while waiting and gain almost nothing.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
@@ -80,16 +76,6 @@ def _protect_names(arguments: Sequence[str]) -> list[str]:
     before = list(itertools.takewhile(lambda word: word != "--", arguments))
     after = arguments[len(before) + 1 :]
     return before + [f"./{word}" if word.startswith("-") else word for word in after]
-
-
-def _refuse_little_memory() -> None:
-    """Refuse a limit on addresses under which nothing runs."""
-    with contextlib.suppress(ImportError):  # Windows
-        import resource
-
-        if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < _LEAST_MEMORY:
-            limit_kb = f"ulimit -v {limit // 1024}"
-            raise StageError("too little memory", found=limit_kb, cure="Allow 1 GB")
 
 
 def _explain(error: Exception) -> StageError:

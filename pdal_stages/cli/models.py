@@ -9,9 +9,8 @@ from pathlib import Path
 
 from ..base.errors import StageError
 from ..base.messages import print_messages
-from . import signals
 from .parser import INPUTS, Parser, add_stage_options, stage_options
-from .tiled_runs import add_tile_sizes, tiling_options
+from .tiled_runs import add_tile_sizes, sigterm_like_ctrl_c, tiling_options
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
 _TRAINING_OPTIONS = (
@@ -77,7 +76,7 @@ def _train(options: argparse.Namespace) -> None:
         surveys,
         named=options.inputs,
     )
-    with signals.sigterm_like_ctrl_c():
+    with sigterm_like_ctrl_c():
         messages = task.run()
     # A model that was written into a pipe or device is not described.
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""

@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs, write_json, write_whole
 from ..base.messages import print_messages
-from . import signals
 from .parser import Parser
 from .tiled_runs import (
     add_tile_options,
+    end_at_ctrl_c,
     end_run,
     print_plan,
     print_run,
     requests_tiles,
     run_files,
+    run_until_interrupted,
     tiling_options,
 )
 
@@ -88,7 +89,7 @@ def _pipeline(options: argparse.Namespace) -> int:
     pipeline.check_outputs(*run_files(options))
     before = list(pipeline.expanded.warnings)
     print_messages(*before)
-    signals.end_at_ctrl_c(options.is_program)
+    end_at_ctrl_c(options.is_program)
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(options.verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot
     # read to 0, say.
@@ -122,7 +123,7 @@ def _run_tiles(options: argparse.Namespace) -> int:
         if "#" not in output.path and Path(output.path).parent.is_dir()
     ]
     check_outputs([*outputs, *files], pipeline.inputs())
-    run, interrupted = signals.run_until_interrupted(
+    run, interrupted = run_until_interrupted(
         lambda: run_tiled(pipeline, tiling, dry_run=options.dry_run)
     )
     print_plan(run) if options.dry_run else print_run(run)

@@ -1,10 +1,13 @@
-"""Runs in tiles at the command line: their flags, what is printed and written, exit codes."""
+"""Runs at the command line: flags of tiles, Ctrl-C, what is printed and written, exit codes."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import signal
+import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -99,6 +102,42 @@ def requests_tiles(options: argparse.Namespace) -> bool:
                     cure="Give the side of the tiles, e.g. --tile 500, or --tile auto",
                 )
     return options.tile is not None
+
+
+# ---- Ctrl-C and SIGTERM --------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def sigterm_like_ctrl_c() -> Iterator[None]:
+    """Make SIGTERM, which service managers and batch systems send, clean up like Ctrl-C."""
+    before = None
+    with contextlib.suppress(ValueError):  # not in the main thread
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
+
+
+def run_until_interrupted(start: Callable[[], TiledRun]) -> tuple[TiledRun, bool]:
+    """Call `start`; return its run, or what was done of it, and whether it was interrupted."""
+    from ..tiling.jobs import InterruptedRun
+
+    with sigterm_like_ctrl_c():
+        try:
+            return start(), False
+        except InterruptedRun as interrupted:
+            return interrupted.run, True
+
+
+def end_at_ctrl_c(is_program: bool) -> None:
+    """Let Ctrl-C end the program while PDAL works, when Python cannot handle signals.
+
+    The next run cleans up.
+    """
+    if is_program and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 # ---- results -------------------------------------------------------------------------------------

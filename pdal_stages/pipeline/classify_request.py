@@ -186,7 +186,7 @@ class ClassifyRequest:
             raise OptionError(
                 "classify writes points",
                 found=target,
-                cure="Name a .laz or .las file. Buildings, trees and more: --objects FILE; "
+                cure="Name a .laz or .las file. Buildings, trees and more: pdal-stages objects; "
                 "rasters: docs/large-areas.md",
             )
         writer = writer_of(target)

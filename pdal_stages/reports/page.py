@@ -95,8 +95,6 @@ def run_page(run: Mapping[str, Any]) -> str:
     """Return the page about a run, in tiles or in one piece: ``TiledRun.to_dict``."""
     done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
-    objects = dict(run.get("objects") or {})
-    objects.pop("files", None)
     tiles = "in one piece"
     if "tile" in run:
         tiles = f"{count_of(len(run['tiles']), 'tile')} of {run['tile']:g}"
@@ -114,7 +112,6 @@ def run_page(run: Mapping[str, Any]) -> str:
         ],
         most=TABLE_ROWS,
         done=len(done),
-        objects={kind: counts for kind, counts in objects.items() if counts["objects"]},
     )
 
 

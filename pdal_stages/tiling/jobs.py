@@ -84,8 +84,6 @@ class TiledRun:
     changed: list[str]  #: files that changed during the run
     messages: list[str]  #: what the user should know
     summary: dict[str, Any]  #: figures for people; see :meth:`to_dict`
-    #: objects of the outputs: their files, and counts by kind
-    objects: dict[str, Any] | None = None
     #: PDAL's, of a run in one piece, which has no tiles
     metadata: dict[str, Any] | None = None
 
@@ -117,7 +115,6 @@ class TiledRun:
                 {"input": job.source and job.source.path, "output": job.outputs} | job.to_dict()
                 for job in self.outputs
             ],
-            **({"objects": self.objects} if self.objects else {}),
         }
 
 

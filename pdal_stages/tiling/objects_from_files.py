@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,11 @@ from ..objects.results import Objects
 from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.json_source import Override
-from ..pipeline.las_chunks import can_read_chunks, read_columns
+from ..pipeline.las_chunks import read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.object_layers import write_objects
 from ..stages.write_objects import STRAIGHT, WriteObjects
-
-if TYPE_CHECKING:
-    from .classify import ClassifyTask
 
 #: Stages whose options the commands accept for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
@@ -38,15 +35,6 @@ OPTIONS_OF = ("writers.objects", "filters.objects")
 _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 #: Meters; cells are not enlarged beyond this automatically: neighboring houses would merge.
 LARGEST_CELL = 4.0
-
-
-def refuse_tiles(task: ClassifyTask) -> None:
-    """Refuse, before any work, what ``classify --objects`` cannot do."""
-    if task.options.per == "tile" or not all(map(can_read_chunks, task.files)):
-        raise OptionError(
-            "classify --objects needs an output for each LAS or LAZ input",
-            cure="Classify first, then: pdal-stages objects OUTPUT town.gpkg",
-        )
 
 
 def objects_of_files(

@@ -205,10 +205,3 @@ def test_a_closed_pipe(command):
         command=["sh", "-c", f"{sys.executable} -m pdal_stages.cli drivers | head -1"]
     )
     assert "BrokenPipe" not in command.runs(done).err
-
-
-def test_little_room(command):
-    done = command.process(
-        command=["sh", "-c", f"ulimit -v 600000; {sys.executable} -m pdal_stages.cli doctor"]
-    )
-    assert done.code == 1 and "Allow 1 GB" in done.err

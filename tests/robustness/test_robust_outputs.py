@@ -184,8 +184,6 @@ REPLACING = [
     (["classify", "two.geojson", "o/", "--model", "m.model", "--report", "b.json", "--metadata", "two.geojson"], INPUT),
     *((["classify", *names, "o/", "--model", "m.model", "--polygons", "poly.geojson=9", "--metadata", "poly.geojson"], INPUT)
       for names in (["a.las"], ["a.las", "b.las"])),
-    ([*CLASSIFY, "o.las", "--polygons", "poly.geojson=9", "--objects", "poly.geojson"], INPUT),
-    ([*CLASSIFY, "o.las", "--objects", "x.geojson", "--metadata", "x.geojson"], "the objects file is the metadata file too"),
     (["accuracy", "ti.geojson", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
     (["accuracy", "a.las", "--reference", "ti.geojson", "--json", "ti.geojson"], INPUT),
     (["objects", "ti.geojson", "t.gpkg", "--metadata", "ti.geojson"], INPUT),
