@@ -40,7 +40,7 @@ class HagMorphological(FarReaching):
         "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote "
         "Sensing 77, 21-30"
     )
-    algorithm_version = 4
+    algorithm_version = 5
     where_help = HEIGHTS_OUTSIDE
     in_models = (*_FILTER, "ignore", "ground", "terrain_slope", "given_ground", "where")
     cell: float = option("number", 1.0, "Side of the grid's cells", 0.05, 1000, unit="m")
@@ -60,7 +60,7 @@ class HagMorphological(FarReaching):
         unit="m",
     )
     threshold: float = option(
-        "number", 0.5, "Maximum distance of ground points from the surface", 0, 1000, unit="m"
+        "number", 0.4, "Maximum distance of ground points from the surface", 0, 1000, unit="m"
     )
     scalar: float = option(
         "number", 1.25, "Added to the threshold per unit of the terrain's slope", 0, 1000
