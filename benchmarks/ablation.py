@@ -305,13 +305,12 @@ ROWS: dict[str, dict[str, Row]] = {
     },
     "wires": {
         "as it is": Row(),
+        "24 neighbors": rule(wires, max_neighbors=24),
         "any neighbors": rule(wires, max_neighbors=10**6),
-        "thick layers": rule(wires, max_thickness_m=9.0),
         "the air around may be full": rule(wires, max_around_ratio=1e9),
         "lines may hide what is below": rule(wires, min_clear_share=0.0),
         "any length": rule(wires, min_length_m=1.0),
         "no gaps": rule(wires, hop_m=1.0),
-        "no bend": rule(wires, max_bend=0.0),
     },
 }
 

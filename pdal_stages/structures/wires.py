@@ -1,7 +1,7 @@
 """Detect wires: long thin lines that hang in the air.
 
-1. A cell's points above the ground are parted into vertical layers. Thin layers with few others
-   beside them may be of a wire.
+1. A cell's points above the ground are parted into vertical layers. Those with few others beside
+   them may be of a wire.
 2. Most pieces of a straight line through such a layer, of `half_m` to both sides, hold others, and
    hardly any layers are close around it.
 3. A line hides nothing: below it as much is seen as on either side, which parts wires from eaves,
@@ -36,20 +36,18 @@ class WireRules(NamedTuple):
     """
 
     min_height_m: float = 4.0  #: above the ground: hedges and fences are lower
-    max_thickness_m: float = 0.9  #: of a layer in a cell: a bundle of wires
-    #: layers about as high in the cells around: 4 wires. Without it results are the same, but
-    #: the detector takes two thirds more time (docs/results/ablation.md)
-    max_neighbors: int = 24
+    #: layers about as high in the cells around a lone one: three wires and more. 24 finds as many
+    #: wires and takes twice as long, any number 3.7 times (docs/results/ablation.md)
+    max_neighbors: int = 18
     neighbor_cells: int = 2  #: cells to every side in which those layers lie: 5 x 5
     same_height_m: float = 2.0  #: layers up to this much higher or lower are neighbors
     half_m: float = 12.0  #: half the length of a line: a wire bends by decimeters over it
     piece_m: float = 2.0  #: length of a line's pieces: points of a wire are nearer to each other
     near_m: float = 0.35  #: points of a line lie this far above or below it: noise and sag
     beside_m: float = 1.0  #: and this far beside it: wind, a layer's mean
-    max_bend: float = 0.02  #: a line's points may lie this much higher or lower per meter along it
     min_run_m: float = 5.0  #: between two layers that give a line its direction
     max_slope: float = 0.6  #: rise over run of a line: wires to a tower on a slope
-    #: pieces of a line that hold thin layers; of 2 * `half_m` / `piece_m`, 12. It does not follow
+    #: pieces of a line that hold lone layers; of 2 * `half_m` / `piece_m`, 12. It does not follow
     #: when these change
     min_filled: int = 8
     #: the air is empty from `near_m` + `clear_m`, 0.8 m, above and below a line, and beside it from
@@ -69,7 +67,7 @@ class WireRules(NamedTuple):
     #: points seen below a line's height on one side, per point on the other
     min_side_ratio: float = 0.2
     #: of the layers on a line that hide nothing: trees and roofs stand close to wires. Without this
-    #: test 0.93 % of Seville's points are wires
+    #: test 0.54 % of Seville's points are wires
     min_clear_share: float = 0.3
     min_length_m: float = 30.0  #: of connected lines: ridges and cables on masts are shorter
     hop_m: float = 6.0  #: gaps in a wire, and how far it goes on into a tree or a tower
@@ -141,8 +139,7 @@ def _find_in_piece(cloud, cell_of, high, near, window, rules) -> NDArray[np.bool
     order, begins = levels(xyz[:, 2], cell)
     layer = np.empty(len(xyz), np.int64)
     layer[order] = np.cumsum(begins) - 1
-    z, first = xyz[order, 2], np.flatnonzero(begins)
-    cells, thick = cell[order[first]], z[np.r_[first[1:], len(z)] - 1] - z[first]
+    cells = cell[order[begins]]
     # From the corners of cells, and sums of whole numbers: neither where the raster begins nor
     # order matters.
     sums = [np.bincount(layer, np.rint(axis * PARTS)) for axis in _in_cells(xyz).T]
@@ -150,7 +147,7 @@ def _find_in_piece(cloud, cell_of, high, near, window, rules) -> NDArray[np.bool
     h, w = window.shape
     layers = _MeanLayers(place, cells, np.searchsorted(cells, np.arange(h * w + 1)), h, w)
     line = np.zeros((len(cells), 3))
-    good = _find_lines(layers, _find_thin(layers, thick, rules), line, rules)
+    good = _find_lines(layers, _find_lone(layers, rules), line, rules)
     if not good.any():
         return good[layer]
     near_all = near[np.argsort(cell_of[near], kind="stable")]
@@ -176,35 +173,35 @@ def _find_in_piece(cloud, cell_of, high, near, window, rules) -> NDArray[np.bool
 
 
 @njit
-def _find_thin(layers, thick, rules):
-    """Return which layers (n,) are thin, with few others around."""
+def _find_lone(layers, rules):
+    """Return which layers (n,) have few others around."""
     place, cells, start, h, w = layers
-    thin, reach = np.zeros(len(thick), np.bool_), rules.neighbor_cells
-    for n in range(len(thick)):
+    lone, reach = np.zeros(len(cells), np.bool_), rules.neighbor_cells
+    for n in range(len(cells)):
         j, i = cells[n] // w, cells[n] % w
         others = 0
         for b in range(max(j - reach, 0), min(j + reach + 1, h)):
             for a in range(max(i - reach, 0), min(i + reach + 1, w)):
                 for m in range(start[b * w + a], start[b * w + a + 1]):
                     others += m != n and abs(place[m, 2] - place[n, 2]) <= rules.same_height_m
-        thin[n] = thick[n] <= rules.max_thickness_m and others <= rules.max_neighbors
-    return thin
+        lone[n] = others <= rules.max_neighbors
+    return lone
 
 
 @njit
-def _find_lines(layers, thin, line, rules):
+def _find_lines(layers, lone, line, rules):
     """Return which layers (n,) have a line; fill `line` (n, 3) with that of each.
 
     Its direction (x, y) and its rise over run.
     """
     place, cells, start, h, w = layers
-    good = np.zeros(len(thin), np.bool_)
+    good = np.zeros(len(lone), np.bool_)
     length = rules.half_m
     reach, half = int(length / CELL_M) + 1, int(length / rules.piece_m)
-    near, slim = np.empty((MAX_NEAR, 3)), np.empty(MAX_NEAR, np.bool_)
+    near, near_lone = np.empty((MAX_NEAR, 3)), np.empty(MAX_NEAR, np.bool_)
     filled = np.zeros(2 * half, np.bool_)
-    for n in range(len(thin)):
-        if not thin[n]:
+    for n in range(len(lone)):
+        if not lone[n]:
             continue
         j, i = cells[n] // w, cells[n] % w
         count = 0
@@ -218,12 +215,12 @@ def _find_lines(layers, thin, line, rules):
                         continue
                     if abs(dz) <= rules.max_slope * length + rules.around_m:
                         near[count, 0], near[count, 1], near[count, 2] = dx, dy, dz
-                        slim[count] = thin[m]
+                        near_lone[count] = lone[m]
                         count += 1
         best, most = 0, 0
         for c in range(count):
             run = np.sqrt(near[c, 0] ** 2 + near[c, 1] ** 2)
-            if not slim[c] or run < rules.min_run_m or abs(near[c, 2]) > rules.max_slope * run:
+            if not near_lone[c] or run < rules.min_run_m or abs(near[c, 2]) > rules.max_slope * run:
                 continue
             ux, uy, rise = near[c, 0] / run, near[c, 1] / run, near[c, 2] / run
             if ux < 0.0 or (ux == 0.0 and uy < 0.0):
@@ -235,8 +232,9 @@ def _find_lines(layers, thin, line, rules):
                 aside = abs(near[m, 1] * ux - near[m, 0] * uy)
                 away = max(aside - rules.beside_m + rules.near_m, abs(near[m, 2] - rise * along))
                 if away <= rules.near_m:
-                    members += slim[m]
-                    filled[min(int((along + length) / rules.piece_m), 2 * half - 1)] |= slim[m]
+                    members += near_lone[m]
+                    piece = min(int((along + length) / rules.piece_m), 2 * half - 1)
+                    filled[piece] |= near_lone[m]
                 elif rules.near_m + rules.clear_m < away <= rules.around_m:
                     crowd += 1
             score = filled.sum()
@@ -317,7 +315,7 @@ def _pair_on_lines(layers, good, line, rules):
                     away = abs(along)
                     if away > rules.half_m or abs(aside) > rules.beside_m:
                         continue
-                    if abs(above) > rules.near_m + rules.max_bend * away:
+                    if abs(above) > rules.near_m:
                         continue
                     if count == len(first):
                         first = np.concatenate((first, first))
