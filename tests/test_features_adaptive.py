@@ -1,7 +1,6 @@
 """k nearest, kopt, ropt and copt against the oracle: members exactly, choices up to real ties."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import oracle
@@ -83,10 +82,9 @@ def columns(points):
     return tuple(np.ascontiguousarray(points[:, i]) for i in range(3))
 
 
-def choose(xyz, queries, token, least=10, cap=math.inf):
+def choose(xyz, queries, token, cap=math.inf):
     """Moments and radii of a neighborhood of queries: (ROWS, m)."""
-    plan = replace(FeaturePlan.parse(token, "Density"), least_members=least)
-    adaptive = FeatureEngine(xyz, plan).neighborhoods()[1]
+    adaptive = FeatureEngine(xyz, FeaturePlan.parse(token, "Density")).neighborhoods()[1]
     (search,) = adaptive.searches
     if cap < math.inf:
         search = search._replace(cap2=cap * cap)
@@ -252,11 +250,9 @@ def test_features_are_finite_and_those_of_each_neighborhood_alone(cloud):
 # ---- ropt --------------------------------------------------------------------------------------------------
 
 
-def oracle_ropt(xyz, q, radii, least=10):
+def oracle_ropt(xyz, q, radii):
     spheres = [oracle.sphere(xyz, q, r) for r in radii]
-    entropies = [
-        oracle.entropy(members) if len(members) >= least else np.inf for members in spheres
-    ]
+    entropies = [oracle.entropy(members) if len(members) >= 10 else np.inf for members in spheres]
     return radii[oracle._first_lowest(entropies)], entropies
 
 
@@ -265,54 +261,13 @@ def test_ropt_is_the_oracle_s(cloud):
     xyz = CLOUDS[cloud]
     queries = some(xyz, 25)
     default, single = radii_of(0.25, 2.0, 0.05), np.array([1.5])
-    for token, radii, least in (
-        ("ropt", default, 3),
-        ("ropt", default, 10),
-        ("ropt(1.5,1.5,1)", single, 10),
-    ):
-        table = choose(xyz, queries, token, least)
+    for token, radii in (("ropt", default), ("ropt(1.5,1.5,1)", single)):
+        table = choose(xyz, queries, token)
         for i, q in enumerate(queries):
-            r, entropies = oracle_ropt(xyz, q, radii, least)
+            r, entropies = oracle_ropt(xyz, q, radii)
             assert table[M.N, i] == len(oracle.sphere(xyz, q, table[M.RADIUS, i]))
             inside = entropies[list(radii).index(table[M.RADIUS, i])]
             assert table[M.RADIUS, i] == r or abs(inside - min(entropies)) < 2e-9, f"query {i}"
-
-
-def dimensionality(members):
-    """Demantke et al. 2011: the entropy of (s1 - s2, s2 - s3, s3) / s1."""
-    values = np.linalg.eigvalsh(np.cov(members.T, bias=True))[::-1]
-    s1, s2, s3 = np.sqrt(np.maximum(values, 0))
-    shares = np.array([s1 - s2, s2 - s3, s3]) / s1
-    return -sum(share * np.log(share) for share in shares if share > 0)
-
-
-def test_rdim_has_the_lowest_entropy_of_dimensionality():
-    radii = radii_of(0.25, 2.0, 0.05)
-    other = 0
-    for xyz in CLOUDS.values():
-        queries = some(xyz, 25)
-        table, by_eigenentropy = choose(xyz, queries, "rdim", 10), choose(xyz, queries, "ropt", 10)
-        other += np.count_nonzero(table[M.RADIUS] != by_eigenentropy[M.RADIUS])
-        for i, q in enumerate(queries):
-            spheres = [oracle.sphere(xyz, q, radius) for radius in radii]
-            entropies = [
-                dimensionality(entry)
-                if len(entry) >= 10 and np.ptp(entry, axis=0).max() > 0
-                else np.inf
-                for entry in spheres
-            ]
-            chosen = list(radii).index(table[M.RADIUS, i])
-            if np.isinf(entropies).all():
-                assert chosen == len(radii) - 1
-            else:
-                assert entropies[chosen] < min(entropies) + 1e-6, f"query {i}"
-    assert other > 20  # it is another neighborhood
-
-
-def test_members_at_exactly_a_radius_are_inside():
-    xyz = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3], [0, 0, -0.3]])
-    table = choose(xyz, xyz[:1], "ropt", 3)
-    assert (table[M.RADIUS, 0], table[M.N, 0], table[M.SZZ, 0]) == (0.3, 5, pytest.approx(0.18))
 
 
 # ---- copt --------------------------------------------------------------------------------------------------
@@ -322,12 +277,9 @@ def test_members_at_exactly_a_radius_are_inside():
 def test_curvature(cloud):
     xyz = CLOUDS[cloud]
     at = np.unique(np.linspace(0, len(xyz) - 1, 20).astype(int))
-    for least in (3, 10):
-        got = FeatureEngine(
-            xyz, replace(FeaturePlan.parse("copt", "Density"), least_members=least)
-        ).curvatures()[at]
-        wanted = [oracle.curvature(xyz, q, least=least) for q in xyz[at]]
-        assert got == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+    got = FeatureEngine(xyz, FeaturePlan.parse("copt", "Density")).curvatures()[at]
+    wanted = [oracle.curvature(xyz, q) for q in xyz[at]]
+    assert got == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
 def test_curvature_threshold_is_the_oracle_s():

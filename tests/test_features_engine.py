@@ -106,7 +106,7 @@ def test_feature_sets():
         ("c1", "linearty", "Linearity"),
         ("c1", "", "names no feature"),
         ("c1", 5, "text"),
-        ("c1", "Radius", "kopt, ropt, rdim and copt"),
+        ("c1", "Radius", "kopt, ropt and copt"),
         ("c1", "Linearity_c2", "none of the neighborhoods"),
         ("c9,q", "all", "unknown neighborhood"),
     ],
@@ -293,7 +293,7 @@ def test_a_missing_dimension_is_asked_for(cloud):
     engine = FeatureEngine(cloud, FeaturePlan.parse("weinmann2018", "Density", "HeightAboveGround"))
     with pytest.raises(DimensionError, match=r"HeightAboveGround.*Give dimensions="):
         engine.run()
-    with pytest.raises(DimensionError, match="one number per query"):
+    with pytest.raises(DimensionError, match="one number for each of"):
         engine.run(dimensions={"HeightAboveGround": np.zeros(3)})
 
 
@@ -303,9 +303,8 @@ def test_a_missing_dimension_is_asked_for(cloud):
 @pytest.mark.parametrize(
     "xyz, message",
     [
-        (np.zeros((3, 2)), r"shape \(n, 3\)"),
+        (np.zeros((3, 2)), r"shape \(3, 2\)"),
         (np.zeros(3), "shape"),
-        ([[1, 2], [3]], "array"),
         (np.zeros((4, 3), "U1"), "float64"),
         (np.zeros((4, 3), complex), "float64"),
         (np.zeros(4, [("X", float), ("Y", float), ("Z", float)]), "float64"),
@@ -318,21 +317,6 @@ def test_a_missing_dimension_is_asked_for(cloud):
 def test_wrong_clouds(xyz, message):
     with pytest.raises(StageError, match=message):
         compute_features(xyz, None, "c1", "Density")
-
-
-@pytest.mark.parametrize(
-    "queries, message",
-    [
-        ([5000], "outside the cloud"),
-        ([-1], "outside the cloud"),
-        ([0.5], "indices"),
-        (np.array([True, False]), "flatnonzero"),
-        (np.zeros((2, 3)), "shape"),
-    ],
-)
-def test_wrong_queries(cloud, queries, message):
-    with pytest.raises(StageError, match=message):
-        compute_features(cloud, queries, "c1", "Density")
 
 
 @pytest.mark.parametrize("far", [1e9, 2.5e9, 1e12])

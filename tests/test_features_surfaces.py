@@ -184,8 +184,6 @@ def test_a_model_reads_them(tmp_path):
     model.save(tmp_path / "m.model")
     again = load_model(tmp_path / "m.model")
     assert "SurfaceVariationStd_k20" in again.passes[0].plan.names
-    first = again.passes[0]
-    assert {column.group for column in first.columns([2, 6])} == {"covariance", "surfaces"}
     prediction = again.predict(xyz, {})
     assert np.array_equal(
         prediction.classification, model.predict(xyz[::-1], {}).classification[::-1]

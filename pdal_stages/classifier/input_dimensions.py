@@ -39,13 +39,13 @@ def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
 
     These are neither coordinates nor return features.
     """
-    others = (name for name in names if return_features.parse(name) is None)
-    return tuple(dict.fromkeys(name for name in others if name not in COORDINATES))
+    known = (*COORDINATES, *return_features.NAMES)
+    return tuple(dict.fromkeys(name for name in names if name not in known))
 
 
 def optional_dimensions(names: Iterable[str]) -> tuple[str, ...]:
     """Return dimensions that features use where a cloud has them: return numbers."""
-    used = any(return_features.parse(name) is not None for name in names)
+    used = any(name in return_features.NAMES for name in names)
     return return_features.SOURCES if used else ()
 
 

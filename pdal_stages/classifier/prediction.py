@@ -198,8 +198,8 @@ class WorkingCloud:
             representatives = replace(representatives, rows=order[:0])
         if wanted is not None:
             wanted = np.flatnonzero(np.isin(order, wanted))
-        sorted_grid = replace(grid, order=np.arange(len(order), dtype=order.dtype))
-        return cls(grid.coordinates, wanted, sorted_grid, rows_in_cloud, order, representatives)
+        sorted_grid = grid._replace(order=np.arange(len(order), dtype=order.dtype))
+        return cls(grid.xyz.T, wanted, sorted_grid, rows_in_cloud, order, representatives)
 
     @property
     def stands_for_others(self) -> bool:

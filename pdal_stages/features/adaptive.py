@@ -1,12 +1,12 @@
-"""Neighborhoods whose size adapts to the points: k nearest, ``kopt``, ``ropt``, ``rdim``, ``copt``.
+"""Neighborhoods whose size adapts to the points: k nearest, ``kopt``, ``ropt``, ``copt``.
 
 All are chosen among nested ones, made of a query's neighbors in the order of distance, whose
 moments are summed up once. The k nearest are the point and its k nearest: n = k + 1 members, as in
-Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest eigenentropy,
-``rdim`` the radius with the lowest entropy of dimensionality. ``copt`` looks at the curvature
-(surface variation) of the sphere of 1 m first: where it is at least c_t the point is *scattered*
-and takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of
-0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
+Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest eigenentropy.
+``copt`` looks at the curvature (surface variation) of the sphere of 1 m first: where it is at least
+c_t the point is *scattered* and takes the best k of 10..50 within 3 m, otherwise it is *regular*
+and takes the best radius of 0.5..2 m [H17]. The threshold c_t follows from the curvatures of the
+whole cloud.
 
 A candidate needs members that do not all coincide: three of them where k is chosen
 (``moments.STRUCTURE_MEMBERS``), ten where a radius is (``neighborhoods.RADIUS_MEMBERS``). Where
@@ -38,14 +38,13 @@ from .nearest_neighbors import (
     sort_near,
 )
 from .neighbor_surfaces import COLUMNS, UP, S, agreement
-from .neighborhoods import AROUND, COPT_REACH
+from .neighborhoods import AROUND, COPT_REACH, RADIUS_MEMBERS
 from .plan import Columns, FeaturePlan, columns_of
 from .point_grid import CellGrid
 from .registry import SURFACE_FEATURES, rows_of
 from .scale_selection import (
     add_up,
     eigenvalues_of,
-    lowest_dimensionality,
     lowest_entropy,
     write_moments,
 )
@@ -69,9 +68,8 @@ NOTHING_FITTED = Fitted()
 CHUNK = 4096
 
 #: Columns of :attr:`Search.choices`: the first candidate among radii and ks, the one behind the
-#: last, the members that a candidate needs, and 1 where the entropy of dimensionality chooses, 0
-#: where the eigenentropy does.
-CHOICE = rows_of("first", "end", "members", "by_dimensionality")
+#: last, and the members that a candidate needs.
+CHOICE = rows_of("first", "end", "members")
 
 
 def radii_of(first: float, last: float, step: float) -> np.ndarray:
@@ -118,9 +116,8 @@ class Search(NamedTuple):
     ks: np.ndarray  # (k,) int64: neighbors besides the point itself, ascending
     within2: float  # all points within this squared distance are wanted
     cap2: float  # and of those within this one as many as the last of `ks` says
-    choices: np.ndarray  # (n, 4) int64: columns as in CHOICE
+    choices: np.ndarray  # (n, 3) int64: columns as in CHOICE
     curved: bool = False  # copt: radii where the point is regular, ks where it is scattered
-    least: int = STRUCTURE_MEMBERS  # members that a sphere needs to have a curvature
     threshold: float = math.nan  # curvature from which on a point is scattered
 
 
@@ -149,7 +146,7 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         super().__init__([c for c in plan.layout if c.at and not c.neighborhood.fixed])
         self.grid, self.halo_m = grid, plan.halo_m
         self.surface_columns = columns_of(self.chosen, SURFACE_FEATURES)
-        self.searches = _searches(self.chosen, plan.least_members)
+        self.searches = _searches(self.chosen)
         self.tree = build_tree(grid.x, grid.y, grid.z)
         self._surfaces = np.zeros((0, len(S)), np.float32)
         if (self.surface_columns >= 0).any():
@@ -157,7 +154,7 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
 
     def _make_surfaces(self, threads: int | None) -> np.ndarray:
         """Return the surface of every point of the cloud, (n, S) float32."""
-        surfaces = np.empty((len(self.grid), len(S)), np.float32)
+        surfaces = np.empty((len(self.grid.order), len(S)), np.float32)
         nearest = _by_number({0: (AROUND, AROUND)})
 
         def fill_part(part: slice) -> None:
@@ -174,16 +171,16 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         return self.grid.x[part], self.grid.y[part], self.grid.z[part]
 
     def _for_all(self, function, threads: int | None) -> None:
-        parts = [slice(start, start + CHUNK) for start in range(0, len(self.grid), CHUNK)]
+        parts = [slice(start, start + CHUNK) for start in range(0, len(self.grid.order), CHUNK)]
         for _ in map_blocks(function, parts, threads):
             pass
 
-    def curvatures(self, least: int, threads: int | None = None) -> np.ndarray:
+    def curvatures(self, threads: int | None = None) -> np.ndarray:
         """Return the curvature of the cloud's points, in the order of the grid, (n,) [H17]."""
-        curvatures = np.empty(len(self.grid))
+        curvatures = np.empty(len(self.grid.order))
         none, radius = np.zeros(0, np.int64), np.array([CURVATURE_RADIUS])
-        choices, within2 = np.zeros((0, 4), np.int64), CURVATURE_RADIUS * CURVATURE_RADIUS
-        search = Search(none, radius, none, within2, within2, choices, True, least)
+        choices, within2 = np.zeros((0, 3), np.int64), CURVATURE_RADIUS * CURVATURE_RADIUS
+        search = Search(none, radius, none, within2, within2, choices, True)
         self._for_all(
             lambda part: self.choose(search, self._part(part), curvature=curvatures[part]), threads
         )
@@ -260,16 +257,14 @@ def _by_number(ranges: dict[int, tuple[int, int]]) -> Search:
     all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
     ks = np.array(sorted(all_ks), np.int64)
     choices = [
-        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, STRUCTURE_MEMBERS, 0]
+        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, STRUCTURE_MEMBERS]
         for first, last in ranges.values()
     ]
     numbers = np.array(list(ranges), np.int64)
-    return Search(
-        numbers, np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64).reshape(-1, 4)
-    )
+    return Search(numbers, np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64))
 
 
-def _searches(chosen: list[Columns], least: int) -> list[Search]:
+def _searches(chosen: list[Columns]) -> list[Search]:
     """Return the searches for adaptive neighborhoods: one for all numbers of neighbors first."""
     ranges, searches = {}, []
     for number, columns in enumerate(chosen):
@@ -279,9 +274,9 @@ def _searches(chosen: list[Columns], least: int) -> list[Search]:
             continue
         radii = radii_of(*(neighborhood.parameters or COPT_RADII))
         within2 = float(radii[-1] * radii[-1])
-        choices = np.array([[0, len(radii), least, neighborhood.kind == "rdim"]], np.int64)
+        choices = np.array([[0, len(radii), RADIUS_MEMBERS]], np.int64)
         ks, numbers = np.zeros(0, np.int64), np.array([number], np.int64)
-        search = Search(numbers, radii, ks, within2, within2, choices, False, least)
+        search = Search(numbers, radii, ks, within2, within2, choices)
         if neighborhood.kind == "copt":
             ks = np.arange(COPT_K[0], COPT_K[1] + 1)
             search = search._replace(ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
@@ -404,7 +399,7 @@ def _curvature(sums, search):
     j = 0
     while search.radii[j] < CURVATURE_RADIUS:
         j += 1
-    if sums[M.N, j] < search.least:
+    if sums[M.N, j] < RADIUS_MEMBERS:
         return SCATTERED
     l1, l2, l3, spread = eigenvalues_of(sums, j)
     total = l1 + l2 + l3
@@ -418,8 +413,6 @@ def _choose(search, j, curvature, scratch):
     members = search.choices[j, CHOICE.members]
     if search.curved and curvature >= search.threshold:
         first, end, members = len(search.radii), len(scratch.ends), STRUCTURE_MEMBERS
-    if search.choices[j, CHOICE.by_dimensionality]:
-        return lowest_dimensionality(scratch.sums, first, end, members)
     return lowest_entropy(scratch.sums, first, end, members)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base import checks
-from ..base.errors import DimensionError, OptionError, StageError, suggest
+from ..base.errors import DimensionError, StageError, suggest
 from ..base.progress import Progress
 from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
@@ -122,11 +122,11 @@ class FeatureEngine:
         self.grid = build_grid(self.cloud, plan.cell) if grid is None else grid
         self._lock = threading.RLock()
         self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
-        self.report = Report({"points": len(self.grid), "queries": 0, "fewer_than_three": {}})
+        self.report = Report({"points": len(self.grid.order), "queries": 0, "fewer_than_three": {}})
 
     def __len__(self) -> int:
         """Return the number of points of the cloud."""
-        return len(self.grid)
+        return len(self.grid.order)
 
     @property
     def fitted(self) -> Fitted:
@@ -157,7 +157,7 @@ class FeatureEngine:
         adaptive = self.neighborhoods()[1]
         assert adaptive is not None
         out = np.empty(len(self))
-        out[self.grid.order] = adaptive.curvatures(self.plan.least_members, self.threads)
+        out[self.grid.order] = adaptive.curvatures(self.threads)
         return out
 
     def shape_values(self, rows: np.ndarray, threshold: float | None) -> dict[str, np.ndarray]:
@@ -232,7 +232,7 @@ class FeatureEngine:
         Parameters as for :meth:`run`.
         """
         run = self.run(queries, **options)
-        values = np.empty((len(run.grid), len(self.plan.names)), np.float32)
+        values = np.empty((len(run.grid.order), len(self.plan.names)), np.float32)
         for block in run.computed(progress):
             values[block.positions] = block.values
         return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
@@ -263,11 +263,11 @@ class Run:
         memory_mb: float,
     ) -> None:
         self.engine, self.plan, self.threads = engine, engine.plan, engine.threads
-        self.indices = None if queries is None else _check_indices(queries, len(engine))
+        self.indices = None if queries is None else np.arange(len(engine))[queries]  # type: ignore[index]
         self.grid = engine.grid
         if self.indices is not None:
             self.grid = build_grid(engine.cloud[self.indices], self.plan.cell)
-        count = len(self.grid)
+        count = len(self.grid.order)
         self.dimensions = (
             dimensions if callable(dimensions) else _dimensions(self.plan, dimensions, count)
         )
@@ -346,46 +346,24 @@ class Run:
                 totals[token] = totals.get(token, 0) + n
 
 
-def _check_indices(queries: npt.ArrayLike, count: int) -> np.ndarray:
-    """Return indices into a cloud of `count` points as int64; OptionError for others."""
-    array = np.asarray(queries)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
-        raise OptionError(
-            "'queries' must be indices of points",
-            found=f"dtype {array.dtype}, shape {array.shape}",
-            cure="Use np.flatnonzero(mask)" if array.dtype.kind == "b" else None,
-        )
-    array = array.astype(np.int64, copy=False)
-    if outside := np.count_nonzero((array < 0) | (array >= count)):
-        raise OptionError(
-            f"'queries' has indices outside the cloud of {count} points", found=outside
-        )
-    return array
-
-
 def _dimensions(
     plan: FeaturePlan, dimensions: Mapping[str, npt.ArrayLike] | None, count: int
 ) -> dict[str, np.ndarray]:
     """Return the plan's dimensions of `count` queries; DimensionError for a missing one."""
-    dimensions = dimensions or {}
-    columns = {}
+    columns = {name: np.asarray(values) for name, values in (dimensions or {}).items()}
     for name in plan.dimensions:
-        if name not in dimensions:
-            if name in ("X", "Y", "Z"):
-                continue
+        if name not in columns and name not in ("X", "Y", "Z"):
             raise DimensionError(
                 f"the dimension '{name}' is needed as a feature but missing",
-                found=", ".join(map(str, dimensions)) or "none",
+                found=", ".join(map(str, columns)) or "none",
                 cure=f"Give dimensions={{'{name}': values}}, or leave it out of the plan",
             )
-        values = np.asarray(dimensions[name])
-        if values.shape != (count,) or values.dtype.kind not in "fiub":
+        if name in columns and columns[name].shape != (count,):
             raise DimensionError(
-                f"the dimension '{name}' must have one number per query",
-                found=f"shape {values.shape}, dtype {values.dtype}, for {count} queries",
+                f"the dimension '{name}' must have one number for each of {count} queries",
+                found=f"shape {columns[name].shape}",
             )
-        columns[name] = values
-    return columns
+    return {name: columns[name] for name in plan.dimensions if name in columns}
 
 
 def compute_features(

@@ -76,7 +76,7 @@ class FixedRadius(NeighborhoodGroup):
     def _run(self, points: Axes, shapes, out: np.ndarray) -> np.ndarray:
         """Return moments (neighborhoods, len(M), m); write shapes where `shapes` says."""
         table = np.empty((len(self), len(M), len(points[0])))
-        fixed_block(self.grid.tables(), points, self.radii, shapes, table, out)
+        fixed_block(self.grid, points, self.radii, shapes, table, out)
         return table
 
 
@@ -108,7 +108,7 @@ def fixed_block(grid, points, radii, shapes, table, out):
 
     Parameters
     ----------
-    grid : GridTables
+    grid : CellGrid
         The cloud.
     points : (x, y, z), (m,) float64 each
     radii : Radii

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..base import checks
 from ..base.errors import OptionError, suggest
 from . import return_features
 from .neighborhoods import (
     AROUND,
-    BY_RADIUS,
     RADIUS_MEMBERS,
     Neighborhood,
     parse_neighborhoods,
@@ -72,9 +70,6 @@ class FeaturePlan:
     features: tuple[str, ...]
     #: The points' own dimensions used as features, after all others.
     dimensions: tuple[str, ...] = ()
-    #: Points a radius of ``ropt``, ``rdim`` and ``copt`` must hold, and the sphere of a curvature
-    #: [H17].
-    least_members: int = RADIUS_MEMBERS
 
     def __post_init__(self) -> None:
         """Refuse a plan with unusable names when it is made."""
@@ -197,18 +192,16 @@ class FeaturePlan:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description; :meth:`from_dict` reads it."""
-        by_radius = any(n.kind in (*BY_RADIUS, "copt") for n in self.neighborhoods)
         return {
             "neighborhoods": [n.token for n in self.neighborhoods],
             "features": list(self.features),
             "dimensions": list(self.dimensions),
-            **({"least_members": self.least_members} if by_radius else {}),
         }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
         """Return the plan that :meth:`to_dict` described; OptionError for unknown words."""
-        members = data.get("least_members", RADIUS_MEMBERS)
-        least = checks.whole("'least_members' of a feature plan", members, 3, 100)
+        if data.get("least_members", RADIUS_MEMBERS) != RADIUS_MEMBERS:  # of earlier versions
+            raise OptionError(f"'least_members' of a feature plan must be {RADIUS_MEMBERS}")
         parsed = tuple(parse_neighborhoods(data["neighborhoods"]))
-        return cls(parsed, tuple(data["features"]), tuple(data["dimensions"]), least)
+        return cls(parsed, tuple(data["features"]), tuple(data["dimensions"]))

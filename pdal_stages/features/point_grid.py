@@ -8,7 +8,6 @@ point a million kilometers away costs one cell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,30 +22,19 @@ LIMIT = 1e12
 FLOAT32_LIMIT = 1e5
 
 
-class GridTables(NamedTuple):
-    """A sorted cloud and its occupied cells as kernels take them; see :class:`CellGrid`."""
-
-    cell: float
-    x: np.ndarray  # (n,) float64, as y and z
-    y: np.ndarray
-    z: np.ndarray
-    cell_ix: np.ndarray
-    cell_start: np.ndarray
-    row_iy: np.ndarray
-    row_start: np.ndarray
-
-
-@dataclass(frozen=True)
-class CellGrid:
-    """A sorted cloud and its occupied cells."""
+class CellGrid(NamedTuple):
+    """A sorted cloud and its occupied cells, a named tuple because compiled kernels read it."""
 
     #: Edge of a cell in meters, a power of two (so that cell corners are exact).
     cell: float
     #: (n,) int32 or int64: ``order[i]`` is the index, in the cloud as it was given, of the i-th
     #: sorted point.
     order: np.ndarray
-    #: (3, n) float64: sorted coordinates, meters.
+    #: (3, n) float64: sorted coordinates, meters; `x`, `y` and `z` are its rows.
     xyz: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
     #: Column number of each occupied cell (m,) and its first point (m + 1,); cells ascend by row,
     #: then column.
     cell_ix: np.ndarray
@@ -54,36 +42,6 @@ class CellGrid:
     #: Row number of each occupied row (r,) and its first cell (r + 1,).
     row_iy: np.ndarray
     row_start: np.ndarray
-
-    def __len__(self) -> int:
-        """Return the number of points."""
-        return len(self.order)
-
-    @property
-    def x(self) -> np.ndarray:
-        """Sorted x, meters."""
-        return self.xyz[0]
-
-    @property
-    def y(self) -> np.ndarray:
-        """Sorted y, meters."""
-        return self.xyz[1]
-
-    @property
-    def z(self) -> np.ndarray:
-        """Sorted z, meters."""
-        return self.xyz[2]
-
-    @property
-    def coordinates(self) -> np.ndarray:
-        """The sorted cloud (n, 3), a view."""
-        return self.xyz.T
-
-    def tables(self) -> GridTables:
-        """Return the grid as kernels take it."""
-        x, y, z = self.xyz
-        cells = self.cell_ix, self.cell_start, self.row_iy, self.row_start
-        return GridTables(self.cell, x, y, z, *cells)
 
 
 def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
@@ -93,43 +51,28 @@ def check_xyz(xyz, what: str = "xyz") -> np.ndarray:
     m) coordinates are refused and counted, and so is float32 too coarse for the size of its
     numbers.
     """
-    try:
-        array = np.asarray(xyz)
-    except ValueError as error:
-        raise StageError(f"'{what}' cannot be made an array", found=str(error)) from None
-    if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 4):
+    array = np.asarray(xyz)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
         raise StageError(
-            f"'{what}' must hold float64 coordinates in meters", found=f"dtype {array.dtype}"
-        )
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise StageError(
-            f"'{what}' must have the shape (n, 3)",
-            found=f"shape {array.shape}",
-            cure="Rows are points: one column each for x, y and z",
+            f"'{what}' must be an array (n, 3) of float64 coordinates in meters",
+            found=f"shape {array.shape}, dtype {array.dtype}",
         )
     # Two reductions and no copy; NaN comes through both.
     largest = float(np.maximum(float(array.max()), -float(array.min()))) if array.size else 0.0
     if not largest <= LIMIT:  # NaN too
-        finite = np.isfinite(array).all(axis=1)
-        bad = int(np.count_nonzero(~finite))
-        if bad:
-            raise StageError(
-                f"'{what}' has points whose coordinates are NaN or infinite",
-                found=f"{bad} of {len(array)} points, the first at index {int(np.argmin(finite))}",
-                cure="Remove them first, e.g. with filters.range or filters.expression",
-            )
-        far = int(np.count_nonzero((np.abs(array) > LIMIT).any(axis=1)))
+        bad = ~(np.abs(array) <= LIMIT).all(axis=1)
         raise StageError(
-            f"'{what}' has coordinates beyond {LIMIT:g} m", found=f"{far} of {len(array)} points"
+            f"'{what}' has coordinates that are NaN, infinite or beyond {LIMIT:g} m",
+            found=f"{np.count_nonzero(bad)} of {len(array)} points, the first at index "
+            f"{int(np.argmax(bad))}",
+            cure="Remove them first, e.g. with filters.range or filters.expression",
         )
-    if array.dtype == np.float32 and largest > FLOAT32_LIMIT:
+    if array.dtype.itemsize < 8 and array.dtype.kind == "f" and largest > FLOAT32_LIMIT:
         raise StageError(
-            f"'{what}' is float32, too coarse for coordinates of this size",
-            found=f"up to {largest:.0f} m, where float32 has steps of "
-            f"{float(np.spacing(np.float32(largest))):.2g} m",
+            f"'{what}' is {array.dtype}, too coarse for coordinates up to {largest:.0f} m",
             cure="Read the coordinates as float64",
         )
-    return array if array.dtype == np.float64 else array.astype(np.float64)
+    return array.astype(np.float64, copy=False)
 
 
 def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
@@ -153,6 +96,9 @@ def build_grid(xyz: np.ndarray, cell: float) -> CellGrid:
         cell=float(cell),
         order=order,
         xyz=ordered,
+        x=ordered[0],
+        y=ordered[1],
+        z=ordered[2],
         cell_ix=ix,
         cell_start=cell_start,
         row_iy=iy[rows],

@@ -67,7 +67,7 @@ FEATURES = (
     Feature("Verticality", "geometric", "1", "1 - abs(nz)"),
     Feature("HeightRange", "geometric", "m", "highest minus lowest z"),
     Feature("HeightStd", "geometric", "m", "standard deviation of z (divisor n)"),
-    Feature("Radius", "geometric", "m", "the chosen radius; kopt, ropt, rdim and copt only",
+    Feature("Radius", "geometric", "m", "the chosen radius; kopt, ropt and copt only",
             ADAPTIVE),
     *(
         Feature(f"{metric}_{number}", "shapes", "1", f"share of pulls in bin {number}: {measured}")
@@ -177,7 +177,7 @@ def expand_words(neighborhoods: Sequence[Neighborhood], words: Sequence[str]) ->
         if wanted & {*SURFACE_FEATURES}:
             cure = "Neighbors' surfaces exist for k20 and the like only"
         if "Radius" in wanted:
-            cure = "Radius exists for kopt, ropt, rdim and copt only"
+            cure = "Radius exists for kopt, ropt and copt only"
         raise OptionError(
             f"none of the neighborhoods has the feature '{', '.join(words)}'",
             found=tokens,
