@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from object_accuracy import compare_buildings
 
-from pdal_stages import Cells, ObjectSettings, find_objects
+from pdal_stages import Cells, find_objects
 from pdal_stages.objects.cells import Kind
 from pdal_stages.objects.outlines import raw_outlines, straight_outlines
 
@@ -51,21 +51,20 @@ def main():
     parser.add_argument("--picture", metavar="FILE", help="of the outlines over the official ones")
     options = parser.parse_args()
     cells, true = delft(options.folder)
-    for step in (ObjectSettings().step, 0.0):
-        found = find_objects(cells, ObjectSettings(step=step), progress=False)
-        raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
-        for name, shapes in (("cells", raw), ("straight", straight_outlines(raw))):
-            shapes = [shapely.transform(shape, lambda xy: xy / 2) for shape in shapes]
-            got = compare_buildings(shapes, true)
-            area, edge = got["area"], got["boundary"]
-            print(
-                f"step {step:g}, {name}: F1 {100 * got['objects']['f1']:.1f} %, "
-                f"{100 * got['covered']:.1f} % of {len(true)} outlines covered by 80 % or more, "
-                f"{100 * area['completeness']:.1f} % of their area, boundary "
-                f"{edge['median']:.2f} m, 95 %: {edge['p95']:.2f} m"
-            )
-        if options.picture and step:
-            draw(options.picture, {(58, 116, 214): true, (190, 30, 36): shapes}, true)
+    found = find_objects(cells, progress=False)
+    raw = raw_outlines(found.tables[Kind.BUILDING], 0.5)
+    for name, shapes in (("cells", raw), ("straight", straight_outlines(raw))):
+        shapes = [shapely.transform(shape, lambda xy: xy / 2) for shape in shapes]
+        got = compare_buildings(shapes, true)
+        area, edge = got["area"], got["boundary"]
+        print(
+            f"{name}: F1 {100 * got['objects']['f1']:.1f} %, "
+            f"{100 * got['covered']:.1f} % of {len(true)} outlines covered by 80 % or more, "
+            f"{100 * area['completeness']:.1f} % of their area, boundary "
+            f"{edge['median']:.2f} m, 95 %: {edge['p95']:.2f} m"
+        )
+    if options.picture:
+        draw(options.picture, {(58, 116, 214): true, (190, 30, 36): shapes}, true)
 
 
 if __name__ == "__main__":

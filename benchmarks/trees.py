@@ -113,14 +113,14 @@ def traunstein(path, south):
 
 
 def package(plot):
-    """x, y, height and estimated diameter of the trees that `pdal-stages objects` finds."""
+    """x, y and height of the trees that `pdal-stages objects` finds."""
     cells = plot.cells
     columns = (
         find_objects(cells, ObjectSettings(cell=cells.size), progress=False)
         .tables[Kind.TREE]
         .columns
     )
-    return np.column_stack([columns[name] for name in ("x", "y", "height", "dbh")])
+    return np.column_stack([columns[name] for name in ("x", "y", "height")])
 
 
 def windows(plot, base=0.8, slope=0.03):
@@ -260,7 +260,7 @@ def main():
         elif cloud.exists():
             plots[name] = labeled(cloud, density)
     for method in (package, *(OTHERS if options.others else ())):
-        rows, layered, stems = [], [], []
+        rows, layered = [], []
         started = time.process_time()
         for name, plot in plots.items():
             tops, true = method(plot), plot.true
@@ -274,7 +274,6 @@ def main():
             hit = np.isin(np.arange(len(true)), b)
             layered.append(np.column_stack([true[:, 2] / np.percentile(true[:, 2], 90), hit]))
             if method is package:
-                stems.append(np.column_stack([tops[a, 3], true[b, 3]]))
                 print(
                     f"{name}: {len(true) / plot.area.area * 1e4:.0f} trees/ha, "
                     f"{len(plot.xyz) / np.prod(np.ptp(plot.xyz[:, :2], axis=0)):.1f} points/m2, "
@@ -295,14 +294,6 @@ def main():
                 print(
                     f"  of {in_band.sum()} trees at {low:g} to {high:g} of the top height found: "
                     f"{hit[in_band].mean():.2f}"
-                )
-            guess, true = np.concatenate(stems)[~np.isnan(np.concatenate(stems)[:, 1])].T
-            if len(true):
-                error = guess - true
-                print(
-                    f"  diameters of {len(true)} stems, {true.mean():.1f} cm in the mean: bias "
-                    f"{error.mean():+.1f} cm, "
-                    f"RMSE {np.sqrt(np.mean(error**2)):.1f} cm"
                 )
 
 

@@ -64,16 +64,6 @@ def test_walls_are_straight(angle):
     assert outline.symmetric_difference(true[0]).area < 0.05 * true[0].area
 
 
-def test_neighbors_share_their_wall():
-    true, cells = turned_rectangles((5, 5, 30, 25), (30, 5, 50, 20), angle=0.4)
-    outlines = straight_outlines(cells)
-    assert all(m.is_valid for m in outlines)
-    assert outlines[0].intersection(outlines[1]).area < 1e-6
-    assert outlines[0].boundary.intersection(outlines[1].boundary).length > 12
-    for m, t in zip(outlines, true, strict=True):
-        assert m.intersection(t).area / m.union(t).area > 0.9
-
-
 def test_holes_stay_and_small_ones_close():
     from pdal_stages import find_objects
     from pdal_stages.objects.cells import Kind

@@ -197,7 +197,7 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..classifier.training_clouds import TrainingCloud
     from ..classifier.training_options import TrainingOptions
     from ..objects.crowns import crown_cells
-    from ..objects.roofs import roof_planes
+    from ..objects.roofs import planes
     from ..structures.decks import find_decks
     from ..structures.wires import find_wires
     from ..terrain import detached_noise, filtered_ground, hag_minima
@@ -230,7 +230,7 @@ def _warmup(options: argparse.Namespace) -> None:
     model = train(TrainingCloud(xyz, classes, dimensions), how, progress=False)
     model.predict(xyz, dimensions, threads=1)
     crown_cells(np.ones((9, 9)), 0.5, 0.5, 2.0)
-    roof_planes(np.ones((9, 9)), 0.5)
+    planes(np.ones((9, 9)), np.ones((9, 9)), 0.5, 1.0)
     if options.all:
         from ..features import warmup as every_neighborhood
 

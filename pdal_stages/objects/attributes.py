@@ -11,8 +11,6 @@ import scipy
 from numpy.typing import NDArray
 
 from .cells import THOUSANDTHS
-from .results import ObjectSettings
-from .roofs import roof_planes
 
 #: Verdicts.
 SURE = "sure"
@@ -97,13 +95,12 @@ class ObjectCells(NamedTuple):
 
 
 def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
-    """Return heights, roof and verdict of a building."""
+    """Return heights and verdict of a building."""
     raster, ground = cells.raster(cells.z), cells.ground_height
     inside, area = ~np.isnan(raster), len(cells.row) * size * size
     above = cells.z - (np.nanmin(cells.low) if math.isnan(ground) else ground)
     edge = ~scipy.ndimage.binary_erosion(inside)[cells.place]
     square = np.ones((math.ceil(RULES.min_building_width / size),) * 2, bool)
-    planes, slope, planar = roof_planes(raster, size)
     facade = np.mean(np.nan_to_num(cells.z[edge] - cells.low[edge]) >= RULES.min_facade)
     ridge = float(np.percentile(above, RIDGE))
     return cells.describe(
@@ -112,9 +109,6 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
             "h_eave": float(np.percentile(above[edge], EAVE)),
             "h_ridge": ridge,
             "ground": ground,
-            "slope": slope,
-            "planes": planes,
-            "planar": planar,
         },
         {
             "no ground near": math.isnan(ground),
@@ -126,11 +120,8 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
     )
 
 
-def measure_tree(
-    cells: ObjectCells, top_row: int, top_column: int, settings: ObjectSettings
-) -> dict[str, Any]:
-    """Return place, height, crown, estimated stem and verdict of a tree."""
-    size = settings.cell
+def measure_tree(cells: ObjectCells, top_row: int, top_column: int, size: float) -> dict[str, Any]:
+    """Return place, height, crown and verdict of a tree."""
     area = len(cells.row) * size * size
     above = cells.z - cells.ground
     highest = int(np.argmax(np.where(np.isnan(above), -np.inf, above)))
@@ -142,7 +133,6 @@ def measure_tree(
             "height": height,
             "area": area,
             "diam": diameter,
-            "dbh": settings.dbh_factor * max(height * diameter, 0.0) ** settings.dbh_power,
             "ground": float(cells.ground[highest]),
         },
         {

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..base.grid import GridWindow, cell_keys, split_keys
 from ..base.progress import Progress
-from . import attributes, crowns, roofs
+from . import attributes, crowns
 from .attributes import ObjectCells
 from .cells import Cells, Kind, object_id
 from .raster_view import MARGIN, NEIGHBORS, CellView, pad_evenly
@@ -34,10 +34,9 @@ BLOCK = 2048
 ROOF_TOLERANCE = 0.5
 #: Fewest cells of a span.
 MIN_SPAN_CELLS = 4
-#: Height step that separates two decks, meters.
-DECK_STEP = 1.0
-#: Smallest area of a deck's part, m2; smaller ones join their neighbor.
-DECK_PART = 10.0
+#: Gap between wires that separates two spans, meters, rounded to an even number of cells; where
+#: that is 0, wires in cells that touch, also at a corner, are one span.
+SPAN_GAP = 2.0
 
 
 class _Object(NamedTuple):
@@ -116,12 +115,10 @@ def _detect_surfaces(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_
     """Yield buildings or decks."""
     view, mask = view.widened_to_whole(core, lambda view: view.roof_or_deck(kind)[0])
     settings, z = view.settings, view.roof_or_deck(kind)[1]
-    area = settings.cell**2
-    step, part, measure = DECK_STEP, DECK_PART, attributes.measure_deck
-    if kind == Kind.BUILDING:
-        step, part, measure = settings.step, settings.roof_part, attributes.measure_building
-    label = roofs.building_parts(mask, z, step=step, smallest=int(np.ceil(part / area)))
-    label = _without_small(label, settings.building_area / area)
+    label = scipy.ndimage.label(mask)[0].astype(np.int64) - 1
+    label = _without_small(label, settings.building_area / settings.cell**2)
+    building = kind == Kind.BUILDING
+    measure = attributes.measure_building if building else attributes.measure_deck
     # Points of a protruding wall, and low ones beside it, belong to the lowest label beside them.
     none = np.iinfo(np.int64).max
     beside = np.where(label < 0, none, label)
@@ -132,8 +129,7 @@ def _detect_surfaces(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_
 
 def _detect_spans(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
     """Yield spans: wires, joined over gaps."""
-    settings = view.settings
-    half_gap = round(settings.span_gap / 2 / settings.cell)
+    half_gap = round(SPAN_GAP / 2 / view.settings.cell)
 
     def mask_of(view: CellView) -> NDArray[np.bool_]:
         wire = view.indices(kind) >= 0
@@ -158,7 +154,7 @@ def _detect_trees(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Obj
         high[mask & (high <= roof + ROOF_TOLERANCE)] = np.nan
     height = crowns.canopy(high, view.ground)
     top = crowns.crown_cells(
-        crowns.smooth(height, settings.smoothing / size),
+        crowns.smooth(height, crowns.SMOOTHING / size),
         settings.tree_height,
         settings.saddle,
         crowns.REACH / size,
@@ -170,7 +166,7 @@ def _detect_trees(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Obj
         if not core.contains(column, row) or len(r) * size**2 < settings.tree_area:
             continue
         cells = view.object_cells(kind, r, c, z)
-        record = attributes.measure_tree(cells, row, column, settings)
+        record = attributes.measure_tree(cells, row, column, size)
         if record["height"] >= settings.tree_height:
             keys = cell_keys(cells.column, cells.row, kind)
             yield _Object(int(object_id(kind, row, column)), record, cells, keys)

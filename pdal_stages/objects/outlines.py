@@ -1,9 +1,8 @@
 """Outlines of objects, along cells or straight, as shapely geometries (extra ``vector``).
 
-Straight outlines follow the main direction of buildings that stand wall to wall. All outlines of
-such a group are simplified together, so that neighbors share their wall. Then the corners are
-adjusted: walls that run nearly along or across the main direction get the same coordinate at both
-ends, the median of what their cells show. Outlines are in numbers of cells until they are written.
+Straight outlines are simplified ones whose corners are moved: walls that run nearly along or across
+the main direction get the same coordinate at both ends, the median of what their cells show.
+Outlines are in numbers of cells until they are written.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ..base.vector import vector
@@ -40,8 +38,7 @@ class OutlineRules:
     crown_tolerance: float = 1.5  #: of a crown's outline; 3 made triangles of small crowns
     #: Of corners: a power of two, so that a shift of the area by whole cells changes no bit.
     precision: float = 1.0 / 1024.0
-    min_group_iou: float = 0.75  #: of straight outlines with cells, all of a group together
-    min_iou: float = 0.4  #: of each straight outline with its cells
+    min_iou: float = 0.75  #: of a straight outline with its cells
     angle_step: float = 0.2  #: between the main directions that are tried, degrees
 
 
@@ -82,63 +79,33 @@ def straight_outlines(raw: list[Any]) -> list[Any]:
         Valid ones, in the same order; the simplified or raw one where the straight one differs too
         much from the cells.
     """
-    shapely = vector("shapely")
-    out = np.array(raw, object)
-    for group in _touching(shapely, raw):
-        corner = np.floor(shapely.total_bounds(out[group])[:2])  # near 0, coordinates are exact
-        local = shapely.transform(out[group], lambda xy, by=corner: xy - by)
-        outline = _straighten(shapely, local)
-        if not _is_faithful(shapely, outline, local):
-            outline = shapely.coverage_simplify(local, RULES.tolerance)
-        if not _is_faithful(shapely, outline, local):
-            outline = local
-        out[group] = shapely.transform(outline, lambda xy, by=corner: xy + by)
-    return list(out)
+    shapely, out = vector("shapely"), []
+    for shape in raw:
+        corner = np.floor(shapely.bounds(shape)[:2])  # near 0, coordinates are exact
+        local = shapely.transform(shape, lambda xy, by=corner: xy - by)
+        simple = shapely.simplify(local, RULES.tolerance)
+        tried = (_straighten(shapely, simple, local), simple, local)
+        outline = next(each for each in tried if _is_faithful(shapely, each, local))
+        out.append(shapely.transform(outline, lambda xy, by=corner: xy + by))
+    return out
 
 
-def _touching(shapely: Any, shapes: list[Any]) -> list[NDArray[np.int64]]:
-    """Return groups of shapes with an edge in common, as indices."""
-    if not shapes:
-        return []
-    a, b = shapely.STRtree(shapes).query(shapes, predicate="touches")
-    all_shapes = np.array(shapes, object)
-    shared = shapely.length(shapely.intersection(all_shapes[a], all_shapes[b])) > 0
-    pairs = (np.ones(shared.sum()), (a[shared], b[shared]))
-    graph = scipy.sparse.coo_matrix(pairs, (len(shapes),) * 2)
-    count, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    order = np.argsort(group, kind="stable")
-    return np.split(order, np.searchsorted(group[order], np.arange(1, count)))
-
-
-def _is_faithful(shapely: Any, outlines: NDArray, shapes: NDArray) -> bool:
-    """Return whether all outlines exist, are valid, and overlap the shapes enough."""
-    if shapely.is_missing(outlines).any() or not shapely.is_valid(outlines).all():
+def _is_faithful(shapely: Any, outline: Any, shape: Any) -> bool:
+    """Return whether an outline is valid and overlaps the shape enough."""
+    if not outline.is_valid:
         return False
-    shared = shapely.area(shapely.intersection(outlines, shapes))
-    union = shapely.area(outlines) + shapely.area(shapes) - shared
-    each = (shared >= RULES.min_iou * union).all()
-    return bool(each and shared.sum() >= RULES.min_group_iou * union.sum())
+    shared = outline.intersection(shape).area
+    return bool(shared >= RULES.min_iou * (outline.area + shape.area - shared))
 
 
-def _straighten(shapely: Any, shapes: NDArray) -> NDArray:
-    """Return straight outlines of shapes that stand wall to wall, or None for each.
-
-    Corners that neighbors share move together.
-    """
-    fine = shapely.segmentize(shapes, 1.0)  # so that neighbors have all corners in common
-    edges = shapely.get_parts(shapely.line_merge(shapely.union_all(shapely.boundary(fine))))
-    simple = shapely.simplify(edges, RULES.tolerance, preserve_topology=False)
-    rings, of_shape = shapely.get_rings(fine, return_index=True)
-    xy, ring = shapely.get_coordinates(rings, return_index=True)
-    kept = np.isin(xy @ [1, 1j], shapely.get_coordinates(simple) @ [1, 1j])
-    too_few = np.bincount(ring[kept], minlength=len(rings)).min() < MIN_RING
-    if too_few or len(np.unique(of_shape)) < len(shapes):
-        return np.full(len(shapes), None, object)
-    rings = shapely.linearrings(xy[kept], indices=ring[kept])
+def _straighten(shapely: Any, simple: Any, shape: Any) -> Any:
+    """Return a simplified polygon with its corners moved so that walls are straight."""
+    rings = shapely.get_rings(simple)
     corners, number = np.unique(shapely.get_coordinates(rings), axis=0, return_inverse=True)
     number = number.ravel()
-    walls = np.unique(np.sort(_segments(shapely, rings, number), axis=1), axis=0)
-    middles = _segments(shapely, shapely.get_rings(fine), xy).mean(axis=1)
+    walls = _segments(shapely, rings, number)
+    fine = shapely.get_rings(shapely.segmentize(shape, 1.0))
+    middles = _segments(shapely, fine, shapely.get_coordinates(fine)).mean(axis=1)
     tree = shapely.STRtree(shapely.linestrings(corners[walls]))
     nearest = tree.nearest(shapely.points(middles))
     angle = main_direction(np.diff(corners[walls], axis=1)[:, 0])
@@ -147,13 +114,9 @@ def _straighten(shapely: Any, shapes: NDArray) -> NDArray:
     edge_of_wall = np.split(_rotate(middles, angle)[order], ends)
     moved = _rotate(_adjust(_rotate(corners, angle), walls, edge_of_wall), -angle)
     moved = np.round(moved[number] / RULES.precision) * RULES.precision
-    out = shapely.polygons(shapely.set_coordinates(rings, moved), indices=of_shape)
+    out = shapely.polygons(*np.split(shapely.set_coordinates(rings, moved), [1]))
     # Remove corners that now lie on a wall.
-    return (
-        shapely.coverage_simplify(out, RULES.corner_tolerance)
-        if shapely.is_valid(out).all()
-        else out
-    )
+    return shapely.simplify(out[0], RULES.corner_tolerance)
 
 
 def _segments(shapely: Any, rings: NDArray, values: NDArray) -> NDArray:

@@ -22,12 +22,12 @@ LAYERS = ("buildings", "trees", "crowns", "spans", "decks")
 #: Columns of each kind, none longer than a shapefile's ten characters; `_TYPES` lists texts and
 #: whole numbers.
 COLUMNS = {
-    Kind.BUILDING: "area h_eave h_ridge ground slope planes planar points reliab verdict reason",
-    Kind.TREE: "height area diam dbh ground points reliab verdict reason",
+    Kind.BUILDING: "area h_eave h_ridge ground points reliab verdict reason",
+    Kind.TREE: "height area diam ground points reliab verdict reason",
     Kind.SPAN: "length h_low z_high sag points reliab verdict reason",
     Kind.DECK: "area z clear ground points reliab verdict reason",
 }
-_TYPES = {"planes": np.int64, "points": np.int64, "verdict": object, "reason": object}
+_TYPES = {"points": np.int64, "verdict": object, "reason": object}
 #: Class whose color the sure objects of a layer have, and their opacity of 255.
 _COLORS = {
     "buildings": (6, 140),

@@ -112,8 +112,7 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
     source = (
         "crowns after Kwak, Lee, Lee, Biging, Gong 2007 (Journal of Forest Research 12, 425-434) "
         "and Chen, Baldocchi, Gong, Kelly 2006 (Photogrammetric Engineering and Remote Sensing "
-        "72, 923-932); diameters of stems after Jucker and others 2017 (Global Change Biology 23, "
-        "177-190)"
+        "72, 923-932)"
     )
     where_help = "Points outside form no object, and keep what they have"
     open_ended = True  # a building may be larger than the surroundings of a tile
