@@ -30,7 +30,7 @@ from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform_task
 from pdal_stages.tiling import dask_workers as dask_cluster
 from pdal_stages.tiling import tiled_run
-from pdal_stages.tiling.checkpoint import Store
+from pdal_stages.tiling.jobs import Store
 
 pytestmark = pytest.mark.pdal
 WORKERS = min(2, available_threads())

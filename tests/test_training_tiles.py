@@ -195,25 +195,13 @@ def corrected(tmp_path_factory, write_las):
     return folder
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        ("--base", "BASE", "--writers.classifiermodel.where=HeightAboveGround < 6 && X < 500040"),
-        ("--surveys", "west=*c[01].laz"),
-        ("--writers.classifiermodel.checked_only=false",),
-    ],
-    ids=["base", "surveys", "as all others"],
-)
-def test_corrections_are_trained_on(corrected, base, tmp_path, run, more):
-    more = tuple(base if word == "BASE" else word for word in more)
-    (whole, tiles), ((out, err), (other, _)) = both(corrected, tmp_path, run, *more)
-    assert whole == tiles and out == other
-    assert ("were checked by a person" in out + err) == ("=false" not in "".join(more))
-
-
-def test_corrections_outside_of_what_is_drawn_from(corrected, tmp_path, run):
-    words = ["train", corrected, *WORDS, "--model", tmp_path / "m.model"]
-    words += ["--writers.classifiermodel.where=X > 500070"]
-    for tiles in ((), ("--tile", "23.5", "--workers", "0")):
-        code, _, err = run(*words, *tiles)
-        assert code == 1 and "no checked point lies inside 'where'" in err
+def test_corrections_are_trained_on_in_one_piece(corrected, base, tmp_path, run):
+    words = ["train", corrected, *WORDS, "--model", tmp_path / "m.model", "--base", base]
+    code, out, err = run(*words)
+    assert code == 0 and "were checked by a person" in out + err
+    (tmp_path / "m.model").unlink()
+    code, _, err = run(*words, "--tile", "23.5", "--workers", "0")
+    assert code == 1 and "are trained on in one piece" in err and not list(tmp_path.iterdir())
+    code, _, err = run(*words, "--writers.classifiermodel.where=X > 500070")
+    assert code == 1 and "no checked point lies inside 'where'" in err
+    both(corrected, tmp_path, run, "--writers.classifiermodel.checked_only=false")

@@ -140,9 +140,8 @@ class ClassifyTask:
                 "several inputs, and the options of tiles, need LAS, LAZ or COPC, which can be cut "
                 "into tiles",
                 found=odd[0],
-                cure="Convert them first (pdal translate INPUT input.laz), or classify them one at "
-                "a time without "
-                "tile options",
+                cure="Convert them first (pdal translate INPUT input.laz, of EPT a part with "
+                "--readers.ept.bounds), or classify them one at a time without tile options",
             )
         target = named = self.output
         if is_folder(self.output):

@@ -21,10 +21,21 @@ from ..base.units import Units
 from ..pipeline.inputs_outputs import LAS_READERS, locations
 from ..pipeline.las_output import replaced
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
-from .checkpoint import fingerprint
-from .options import Density, Extent, TilingOptions, block_bytes, choose_tiles, tiles_per_square
+from .jobs import fingerprint
+from .options import (
+    Box,
+    Density,
+    Extent,
+    TileGrid,
+    TilingOptions,
+    block_bytes,
+    check_number,
+    choose_tiles,
+    tiles_per_square,
+    touching,
+    union,
+)
 from .plan import TilePlan, outputs_for
-from .tile_grid import Box, TileGrid, check_number, touching, union
 
 
 @dataclass(frozen=True)
@@ -108,7 +119,8 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
             raise PipelineError(
                 f"{reader['type']} cannot read a part of a file, so it cannot be cut into tiles",
                 found=name,
-                cure="Convert the input first: pdal translate INPUT input.laz",
+                cure="Convert the input first: pdal translate INPUT input.laz (of EPT a part, "
+                "with --readers.ept.bounds)",
             )
         elif isinstance(name, list):
             paths = name

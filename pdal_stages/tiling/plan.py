@@ -17,7 +17,7 @@ from ..pipeline.json_source import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import MOVING
 from ..stages.base import Blocks, Stage, first_round_of
-from .tile_grid import Box, TileGrid
+from .options import Box, TileGrid
 
 #: Dimension that follows a point through a tile's pipeline: its row in the piece of its input.
 ROW = "PdalStagesRow"
@@ -293,17 +293,15 @@ def _check_linear(steps: list[_Step]) -> None:
                 where=step.where,
                 found=f"{step.type} after {before.type}",
             )
-        wanted = step.options.pop("inputs", None)
-        if wanted is not None and before and step.rank:
-            names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))
-            if names not in (readers, {str(before.options.get("tag"))}):
-                raise PipelineError(
-                    "a pipeline in tiles is linear; this stage takes only some of the points "
-                    "before it",
-                    where=step.where,
-                    found=f"inputs {sorted(names)}",
-                    cure="Run one pipeline for each branch",
-                )
+        wanted = step.options.pop("inputs", None) or []
+        names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))
+        if names and before and names not in (readers, {str(before.options.get("tag"))}):
+            raise PipelineError(
+                "in tiles a stage takes all points of those before it",
+                where=step.where,
+                found=f"inputs {sorted(names)}",
+                cure="Run one pipeline for each branch",
+            )
 
 
 def _check_ends(readers: list[_Step], filters: list[_Step], writers: list[_Step]) -> None:

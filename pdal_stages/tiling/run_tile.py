@@ -33,11 +33,11 @@ from ..pipeline.spatial_reference import NO_REFERENCE
 from ..stages.base import WHOLE_CLOUD, FarReaching, inside_block
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
 from ..stages.registry import stage_types
-from .checkpoint import load_arrays, save_arrays, written
 from .inputs import InputSource
+from .jobs import load_arrays, save_arrays, written
+from .options import Box, TileGrid, inside
 from .plan import INPUT, OUTSIDE, ROW, RunContext
 from .sorted_points import Piece, cut_all
-from .tile_grid import Box, TileGrid, inside
 from .write_outputs import (
     NewValues,
     PieceResults,
@@ -253,10 +253,8 @@ class _HeadRun:
         mixed = flags if len(set(flags)) > 1 else []
         stages, last_read = read_with(self.callbacks, readers, marked, mixed)
         steps = plan.head[part.begin : part.end]
-        apart = len(self.pieces) > 1 and bool(steps) and not _merges(steps[0])
-        if apart:  # PDAL's own filters see one file at a time, until a stage merges them
-            stages.append({"type": "filters.groupby", "dimension": INPUT, "inputs": [last_read]})
-            last_read = stages[-1]["tag"] = "apart"
+        # PDAL's own filters see one file at a time, until a stage merges them.
+        apart = len(self.pieces) > 1
         head_begins = len(stages)
         for number, step in enumerate(steps, part.begin):
             if apart and _merges(step):

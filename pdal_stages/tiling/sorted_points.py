@@ -23,7 +23,7 @@ from ..base.grid import begins_run
 from ..pipeline.las_chunks import laspy_header, read_chunks
 from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource, digest_of
-from .tile_grid import Box, TileGrid, check_number
+from .options import Box, TileGrid, check_number
 
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, for which one piece need not wait
     import laspy

@@ -23,14 +23,12 @@ from ..pipeline.json_source import Override
 from ..pipeline.las_output import files_with_flags_to_split
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
-from .checkpoint import Store, fingerprint
 from .inputs import CloudIndex, Survey
-from .jobs import InterruptedRun, Job, TiledRun, messages_of, summarize
-from .options import TilingOptions, worker_bytes
+from .jobs import InterruptedRun, Job, Store, TiledRun, fingerprint, messages_of, summarize
+from .options import Box, TileGrid, TilingOptions, worker_bytes
 from .plan import RunContext, TilePlan, make_plan, outputs_for
 from .run_tile import block_name, blocks_near, make_block, run_tile, square_name
 from .sorted_points import TEMPORARY, sort_points
-from .tile_grid import Box, TileGrid
 from .write_outputs import write_file
 
 #: A run stops when this many tiles failed for the same reason and none succeeded (not tuned).
@@ -436,17 +434,11 @@ class _Run:
             task_of = partial(self._tile_task, number)
             for job in self._do(label, self._unkept(squares), task_of):
                 self.messages_before.append(job.record.get("messages", []))
-            reasons = {job.reason for job in squares}
-            if len(waiting) >= _HOPELESS and len(reasons) == 1 and "" not in reasons:
-                raise StageError(
-                    "all tiles failed for the same reason, so the run was stopped",
-                    found=reasons.pop(),
-                )
             for job in blocks:
                 job.fail_with(job.jobs)
             for _ in self._do(f"{label}, blocks", self._unkept(blocks), self._block_task):
                 pass
-            self.squares += self._known_squares(number, squares)
+            self.squares += squares
         for job in waiting:
             job.fail_with(job.jobs)
 
@@ -518,15 +510,6 @@ class _Run:
         """Return the task that computes a block."""
         squares = [self.store.path(each.name) for each in job.jobs]
         return partial(make_block, self._context, job.tile, squares, self.store.path(job.name))
-
-    def _known_squares(self, number: int, squares: list[Job]) -> list[Job]:
-        """Return the jobs of a round with those that only an earlier run needed."""
-        places = self._points_of_squares.keys() - {job.tile for job in squares}
-        others = [self._square_job(number, place) for place in places]
-        for job in others:
-            note = self.store.note(job.name)
-            job.record = note if note.get("fingerprint") == job.mark else {}
-        return [*squares, *others]
 
 
 def _make_ready(out: Job, waiting: deque[Job]) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs, work_folder
 from ..base.report import Report
+from ..classifier.input_dimensions import CHECKED
 from ..classifier.model import Model
 from ..classifier.model_description import FILE_NUMBER
 from ..classifier.training import reach, train
@@ -31,13 +32,12 @@ from ..pipeline.pdal import reader_of
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, points_of_views
 from ..pipeline.spatial_reference import check_readers
-from ..stages.checked_points import CheckedChoice, CheckedPoints
 from ..stages.points import Points
 from ..stages.preprocessing import preparation_of
 from ..stages.registry import stage_from
 from ..stages.train_model import TrainModel
-from .checkpoint import load_arrays, save_arrays, written
 from .inputs import las_extent
+from .jobs import load_arrays, save_arrays, written
 from .options import TilingOptions, fits_whole
 from .plan import plan_of_files
 from .tiled_run import run_plan
@@ -46,10 +46,6 @@ from .write_outputs import NewValues, PieceResults, of_own_points, read_with
 #: Bytes of a point in training in one piece, with voxels and neighborhoods of samples: 20 million
 #: points took 7,922 MiB (docs/train.md).
 TRAIN_POINT = 400
-#: Array of points that a person checked: see :mod:`..stages.checked_points`.
-_WANTED = "PdalStagesWanted"
-#: Array of other points that the base model is sure of.
-_SURE = "PdalStagesSure"
 #: Failed tiles that a message names.
 _NAMED = 3
 
@@ -285,21 +281,14 @@ class TrainTask:
         side = run.summary["tile"] * run.summary["meters_per_unit"]
         tiled = TiledCloud(folder / "cloud", side)
         dimensions: list[str] | None = None
-        looked = (job.record["looked"] for job in run.tiles if "looked" in job.record)
-        choice = (
-            self.stage.choice(looked) or None
-        )  # what samples are drawn from, where a person checked any
-        if choice:
-            choice.report_to(report)
         for job in run.tiles:
             if "dimensions" in job.record:
                 assert job.outputs is not None
                 _check_same(job.record["dimensions"], dimensions or job.record["dimensions"])
                 dimensions = job.record["dimensions"]
-                cloud = _read_back(job.outputs[0], self.stage.named, choice)
-                if self.survey:
-                    cloud = replace(cloud, name=self.survey, survey=self.survey)
-                tiled.put(job.tile, cloud)
+                arrays, name = load_arrays(job.outputs[0]), self.survey or self.stage.named
+                cloud = TrainingCloud(arrays["xyz"], arrays["labels"], name=name)
+                tiled.put(job.tile, cloud.with_arrays(arrays))
             for path in job.outputs or ():
                 Path(path).unlink(missing_ok=True)
         if dimensions is None:
@@ -316,15 +305,6 @@ def _check_same(names: Sequence[str], before: Sequence[str]) -> None:
             found=f"{', '.join(names)}; before: {', '.join(before)}",
             cure="Name those that all have: --writers.classifiermodel.dimensions=HeightAboveGround",
         )
-
-
-def _read_back(path: str, name: str, choice: CheckedChoice | None) -> TrainingCloud:
-    """Return the points of a tile, as :func:`take_points` wrote them."""
-    arrays = load_arrays(path)
-    wanted, sure = (arrays.pop(f"d/{mark}", np.zeros(0, np.bool_)) for mark in (_WANTED, _SURE))
-    if choice is not None:
-        arrays["mask"] = choice.mask(CheckedPoints(wanted, sure, arrays["labels"]), arrays["xyz"])
-    return TrainingCloud(arrays["xyz"], arrays["labels"], name=name).with_arrays(arrays)
 
 
 def take_points(
@@ -357,17 +337,16 @@ def take_points(
     points = points_of_views(run.arrays, run.metadata, stage.points)
     run.arrays.clear()
     training = stage.training_on(points)
-    marks: dict[str, NDArray] = {}
-    looked: dict[str, Any] = {}
-    if stage.checked_only:
-        checked, counts = stage.checked_points(points)
-        marks, looked = {_WANTED: checked.wanted, _SURE: checked.sure}, {"looked": counts}
-    save_arrays(outputs[0], stage.cloud_of(points, training, marks).arrays)
+    if stage.checked_only and np.any(points.arrays.get(CHECKED, 0)):
+        raise StageError(
+            "points that a person checked are trained on in one piece",
+            cure="Give only the files that have any, without --tile, or more --memory",
+        )
+    save_arrays(outputs[0], stage.cloud_of(points, training).arrays)
     return {
         "outputs": written(outputs),
         "written": run.count,
         "messages": points.report.messages,
         "ignored": int(points.report.figures.get("ignored", 0)),
         "dimensions": list(training.dimensions),
-        **looked,
     }

@@ -26,8 +26,8 @@ from ..pipeline.las_chunks import laspy_header, read_chunks
 from ..pipeline.run import execute_whole
 from ..pipeline.runtime import Callbacks
 from ..stages.points import class_counts
-from .checkpoint import load_arrays, written
 from .inputs import InputSource
+from .jobs import load_arrays, written
 from .options import MOST_AT_ONCE
 from .plan import TilePlan
 from .sorted_points import BLOCK, Piece, write_records
@@ -74,16 +74,13 @@ def changed_in(
     read: NDArray,
     rows: NDArray[np.int64] | None,
     values: NDArray,
-    holds_flags: NDArray[np.bool_] | bool,
+    holds_flags: bool,
 ) -> NDArray:
-    """Return a dimension (n,) with new values in some or all rows; keep flags in the class.
-
-    `holds_flags` (n,) tells of which points the class holds flags.
-    """
+    """Return a dimension (n,) with new values in some or all rows; keep flags in the class."""
     out = np.array(read)
     out[slice(None) if rows is None else rows] = values
-    if name == "Classification" and np.any(holds_flags):
-        out |= np.where(holds_flags, read & ~np.uint8(LEGACY_LIMIT), np.uint8(0))
+    if name == "Classification" and holds_flags:
+        out |= read & ~np.uint8(LEGACY_LIMIT)
     return out
 
 
@@ -119,9 +116,9 @@ def read_results(
     """
     kept = np.zeros(end - start, bool)
     seen = 0
-    columns: dict[str, list[tuple[NDArray, NDArray]]] = {}
-    for name in tiles:
-        arrays = load_arrays(name, [source.key, "own"])
+    values: dict[str, NDArray] = {}
+    for path in tiles:
+        arrays = load_arrays(path, [source.key, "own"])
         if source.key not in arrays:
             continue
         points, index = arrays[source.key], arrays[source.key]["index"]
@@ -130,12 +127,14 @@ def read_results(
         rows = index[first:last] - start
         if (index.size and index[-1] >= count) or kept[rows].any():
             raise StageError(
-                "internal: two tiles hold the same point", where=source.path, found=name
+                "internal: two tiles hold the same point", where=source.path, found=path
             )
         kept[rows] = True
         for field in list(points.dtype.fields or ())[1:]:
-            column = points[field][first:last].copy()
-            columns.setdefault(field.removeprefix("dim/"), []).append((rows, column))
+            name = field.removeprefix("dim/")
+            if name not in values:
+                values[name] = np.zeros(end - start, points[field].dtype)
+            values[name][rows] = points[field][first:last]
     if seen != count:
         raise StageError(
             "the tiles do not hold all points of the file: the file changed during the run",
@@ -143,16 +142,7 @@ def read_results(
             found=f"{seen:,} of {count:,} points",
             cure="Start the run again with --resume",
         )
-    values: dict[str, tuple[NDArray[np.int64] | None, NDArray]] = {}
-    for name, parts in columns.items():
-        rows, new = (np.concatenate(each) for each in zip(*parts, strict=True))
-        if len(rows) == end - start:
-            full = np.empty_like(new)
-            full[rows] = new
-            values[name] = (None, full)
-        else:
-            values[name] = (rows, new)
-    return NewValues(kept, values)
+    return NewValues(kept, {name: (None, column) for name, column in values.items()})
 
 
 # ---- the tail ------------------------------------------------------------------------------------
@@ -188,11 +178,12 @@ def run_tail(
 def read_with(
     callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: Sequence[bool]
 ) -> tuple[list[dict[str, Any]], str]:
-    """Return stages that read and merge points and set new values, and the tag of the last one.
+    """Return stages that read points and set new values, and the tag of the last one.
 
-    One filter sets the values of all readers: the time PDAL needs grows with the third power of the
-    number of filters that add dimensions. `flags`: of each reader, whether flags must be split from
-    the class (old PDAL); empty for none.
+    The points of each reader stay a view of their own, in the order of the readers. One filter sets
+    the values of all: the time PDAL needs grows with the third power of the number of filters that
+    add dimensions. `flags`: of each reader, whether flags must be split from the class (old PDAL);
+    empty for none.
     """
     stages: list[dict[str, Any]] = []
     last = []
@@ -204,51 +195,33 @@ def read_with(
             )
             stages.append(splitter)
         last.append(stages[-1]["tag"])
-    if len(readers) > 1:
-        stages.append({"type": "filters.merge", "inputs": last, "tag": "merged"})
-        last = ["merged"]
-    counts = [len(each.kept) for each in new]
-    holds_flags = np.repeat([flags_in_classes(reader["filename"]) for reader in readers], counts)
-    stages += _put(callbacks, _join_readers(new), last, holds_flags)
+    stages += _put(callbacks, new, last, [flags_in_classes(each["filename"]) for each in readers])
     return stages, stages[-1]["tag"]
 
 
-def _join_readers(new: Sequence[NewValues]) -> NewValues:
-    """Return new values for the points of several readers, one after the other."""
-    if len(new) == 1:
-        return new[0]
-    starts = np.cumsum([0, *(len(each.kept) for each in new)])
-    values: dict[str, tuple[NDArray[np.int64] | None, NDArray]] = {}
-    for name in dict.fromkeys(name for each in new for name in each.values):
-        parts = [(n, *each.values[name]) for n, each in enumerate(new) if name in each.values]
-        columns = np.concatenate([column for _, _, column in parts])
-        rows = None
-        if len(columns) < starts[-1] or any(at is not None for _, at, _ in parts):
-            rows = np.concatenate(
-                [starts[n] + (np.arange(len(c)) if at is None else at) for n, at, c in parts]
-            )
-        values[name] = rows, columns
-    return NewValues(np.concatenate([each.kept for each in new]), values)
-
-
 def _put(
-    callbacks: Callbacks, new: NewValues, inputs: list[str], holds_flags: NDArray[np.bool_]
+    callbacks: Callbacks, new: Sequence[NewValues], inputs: list[str], holds_flags: list[bool]
 ) -> Iterator[dict[str, Any]]:
-    """Yield filters that set new values of points, and drop some: PDAL needs two filters."""
+    """Yield filters that set new values of points, and drop some: PDAL needs two filters.
+
+    PDAL calls each for the points of one reader after the other.
+    """
+    to_put, to_drop = zip(new, holds_flags, strict=True), iter(new)
 
     def put(module, ins, outs) -> None:
-        if len(ins["X"]) != len(new.kept):
-            raise StageError(f"the readers gave {len(ins['X']):,} points of {len(new.kept):,}")
-        for name, (rows, values) in new.values.items():
-            outs[name] = changed_in(name, ins[name], rows, values, holds_flags)
+        part, has_flags = next(to_put)
+        if len(ins["X"]) != len(part.kept):
+            raise StageError(f"a reader gave {len(ins['X']):,} points of {len(part.kept):,}")
+        for name, (rows, values) in part.values.items():
+            outs[name] = changed_in(name, ins[name], rows, values, has_flags)
 
     def drop(module, ins, outs) -> None:
-        outs["Mask"] = np.ascontiguousarray(new.kept, bool)
+        outs["Mask"] = np.ascontiguousarray(next(to_drop).kept, bool)
 
-    types = {name: values.dtype.name for name, (_, values) in new.values.items()}
+    types = {name: v.dtype.name for part in new for name, (_, v) in part.values.items()}
     adds = {name: _FLOATS.get(kind, f"{kind}_t") for name, kind in types.items()}
     yield callbacks.filter(put, adds, inputs=inputs, tag="put")
-    if not new.kept.all():
+    if not all(part.kept.all() for part in new):
         yield callbacks.filter(drop, inputs=["put"], tag="left")
 
 
@@ -348,8 +321,8 @@ def _in_parts(
 
 
 def _classes(new: NewValues) -> dict[str, int]:
-    _, codes = new.values.get("Classification", (None, np.zeros(0, np.uint8)))
-    return class_counts(codes)
+    _, codes = new.values.get("Classification", (None, np.zeros(len(new.kept), np.uint8)))
+    return class_counts(codes[new.kept]) if "Classification" in new.values else {}
 
 
 def write_tile(

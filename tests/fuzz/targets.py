@@ -41,8 +41,8 @@ from pdal_stages.pipeline.json_source import (
     parse_pipeline,
 )
 from pdal_stages.tiling import inputs
+from pdal_stages.tiling.options import TileGrid
 from pdal_stages.tiling.sorted_points import sort_points
-from pdal_stages.tiling.tile_grid import TileGrid
 
 TESTS = Path(__file__).resolve().parents[1]
 #: Name -> what is called, and good inputs to start from.
