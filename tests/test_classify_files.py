@@ -101,27 +101,11 @@ def test_a_file_where_the_folder_should_be(folder, classify, tmp_path):
         assert code == 1 and "folder" in err and "t0.laz written" not in err
 
 
-def test_inputs_of_one_name_lie_in_their_folders(folder, classify, tmp_path):
-    (tmp_path / "in/2023").mkdir(parents=True)
-    (tmp_path / "in/2024/north").mkdir(parents=True)
-    for place, name in (("2023", "t0"), ("2024/north", "t1")):
-        content = (folder / f"in/{name}.laz").read_bytes()
-        (tmp_path / "in" / place / f"{name}.laz").write_bytes(content)
-    known, out = str(tmp_path / "in/**/*.laz"), tmp_path / "out"
-    code, _, err = classify(known, f"{out}/", "--resume")
-    assert code == 0 and files_in(out) == ["t0.laz", "t1.laz"], err
-    (tmp_path / "in/2024/t0.laz").write_bytes((folder / "in/t2.laz").read_bytes())
-    for number in range(2):  # another name: one of them comes twice now, and all go into folders
-        code, output, err = classify(known, f"{out}/", "--resume")
-        assert code == 0, err
-        assert output.count(".laz: 500 points") == (3, 0)[number]
-    inside = ["2023/t0.laz", "2024/north/t1.laz", "2024/t0.laz"]
-    for name, part in zip(inside, ("t0", "t1", "t2"), strict=True):
-        source = laspy.read(folder / f"in/{part}.laz")
-        assert np.array_equal(laspy.read(out / name).xyz, source.xyz)
-    code, _, err = classify(known, f"{tmp_path}/c_#.laz")
+def test_inputs_of_one_name_are_refused(folder, classify, tmp_path):
+    (tmp_path / "t0.laz").write_bytes((folder / "in/t0.laz").read_bytes())
+    code, _, err = classify(folder / "in", tmp_path / "t0.laz", f"{tmp_path}/out/")
     assert code == 1 and "two inputs have the same name" in err and "folder" in err
-    code, _, err = classify(known, f"{tmp_path}/in")
+    code, _, err = classify(folder / "in", f"{folder}/in/")
     assert code == 1 and "one of the inputs" in err
     code, output, err = classify(folder / "in", folder / "in" / "t0.laz", tmp_path / "other")
     assert code == 0 and "3 files written" in output, err  # one that is named twice is read once

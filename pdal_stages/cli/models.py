@@ -7,7 +7,6 @@ import contextlib
 import json
 from pathlib import Path
 
-from ..base.errors import StageError
 from ..base.messages import print_messages
 from .parser import INPUTS, Parser, add_stage_options, stage_options
 from .tiled_runs import add_tile_sizes, sigterm_like_ctrl_c, tiling_options
@@ -37,7 +36,6 @@ def add_commands(parser: Parser) -> None:
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     reference = "True classes: the same points in their order"
     add("--reference", action="append", metavar="FILE", help=reference)
-    add("--model", help="Classify labeled files with this model and score it")
     dimension = "Dimension to score (Classification)"
     add("--dimension", default="Classification", metavar="NAME", help=dimension)
     add("--reference-dimension", metavar="NAME", help="Dimension with the true classes")
@@ -89,13 +87,11 @@ def _train(options: argparse.Namespace) -> None:
 def _accuracy(options: argparse.Namespace) -> None:
     from ..pipeline.accuracy_files import compare_files
 
-    if options.reference and options.model:
-        raise StageError("--reference and --model exclude each other", found=options.model)
-    other = "Classification" if options.reference or options.model else "Reference"
+    other = "Classification" if options.reference else "Reference"
     dimensions = options.dimension, options.reference_dimension or other
     outputs = {k: v for k in ("json", "html") if (v := getattr(options, k))}
-    settings = *dimensions, options.overrides, options.model or ""
-    print_messages(*compare_files(options.inputs, options.reference or (), *settings, **outputs))
+    files = options.inputs, options.reference or ()
+    print_messages(*compare_files(*files, *dimensions, options.overrides, **outputs))
 
 
 def _model(options: argparse.Namespace) -> None:

@@ -19,7 +19,7 @@ from ..stages.points import SELECTED
 from ..stages.registry import stage_from, stage_types
 from .inputs_outputs import is_las, writes_las
 from .json_source import Override, overridden
-from .las_output import extra_dims_option
+from .las_files import extra_dims_option
 from .pdal import reader_of, writer_of
 from .run import Pipeline
 

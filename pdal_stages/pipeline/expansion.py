@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..base.errors import DimensionError, PipelineError, StageError
-from ..base.las import read_header
 from ..base.las_repair import extra_dimensions
 from ..classifier.model_file import find
 from ..stages import preprocessing
@@ -24,7 +23,7 @@ from ..stages.registry import PDAL_OWN, stage_from, stage_type, stage_types
 from . import pdal as pdal_env
 from .inputs_outputs import is_reader, readers_files
 from .json_source import PipelineSource
-from .las_output import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
+from .las_files import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
 from .runtime import BY_LABEL, TRAMPOLINE, ExpandedStage, python_filter
 from .spatial_reference import fault_of_reference
 
@@ -56,7 +55,7 @@ def expand(
     places = [source.where(number) for number in range(len(stages))]
     _refuse_several_ends(stages, places)
     check_copc_outputs(stages)
-    out = Expanded([], warnings=unread_extra_dimensions(stages))
+    out = Expanded([])
     flags = _flags_to_split(stages) if whole else []
     readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
     names = [str(stages[number].get("filename", "")) for number in readers]
@@ -256,24 +255,6 @@ def _may_create(name: str, stage: Mapping[str, Any]) -> bool:
     if stage["type"] in _CREATES_ANY or name in heights_of(stage):
         return True
     return any(name in str(value) for key, value in stage.items() if key not in ("type", "tag"))
-
-
-def unread_extra_dimensions(stages: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a warning for each file of LAS 1.0-1.3 whose extra dimensions PDAL does not read."""
-    warnings = []
-    for stage in stages:
-        if str(stage.get("use_eb_vlr", "")).lower() == "true" or "extra_dims" in stage:
-            continue
-        for path in readers_files([stage], las=True):
-            header, names = read_header(path), list(extra_dimensions(path))
-            if header is not None and header.minor < 4 and names:
-                listed = ", ".join(names[:5]) + ", ..." * (len(names) > 5)
-                warnings.append(
-                    f"{path}: its extra dimensions are not read: {listed}. In LAS "
-                    f"1.{header.minor}, PDAL reads them only if the reader has "
-                    '"use_eb_vlr": true'
-                )
-    return warnings
 
 
 # ---- one stage -----------------------------------------------------------------------------------

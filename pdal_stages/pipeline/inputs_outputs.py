@@ -125,24 +125,11 @@ def is_folder(target: str) -> bool:
     return path.is_dir() or target.endswith(("/", os.sep)) or named
 
 
-def in_folders(sources: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the names of outputs in a folder.
-
-    Where two are equal, each begins with its input's folder below the inputs' common one.
-    """
-    if len(set(names)) == len(names) or any("://" in source for source in sources):
-        return list(names)
-    folders = [os.path.dirname(os.path.abspath(source)) for source in sources]
-    shared = os.path.commonpath(folders)
-    pairs = zip(folders, names, strict=True)
-    return [os.path.normpath(f"{os.path.relpath(folder, shared)}/{name}") for folder, name in pairs]
-
-
 def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[str]:
     """Return an output for each input, with its name in place of ``#``.
 
-    The file name ``#`` alone takes the input's suffix, too (see :func:`in_folders`). With `copc`,
-    COPC inputs become COPC outputs, else plain LAZ.
+    The file name ``#`` alone takes the input's suffix, too. With `copc`, COPC inputs become COPC
+    outputs, else plain LAZ.
     """
     path = Path(target)
     names = [Path(source).name for source in sources]
@@ -150,7 +137,7 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
     if path.name == "#":
         pairs = zip(names, stems, strict=True)
         names = [f"{stem}.laz" if named_copc(n) and not copc else n for n, stem in pairs]
-        outputs = [str(path.parent / name) for name in in_folders(sources, names)]
+        outputs = [str(path.parent / name) for name in names]
     else:
         outputs = named_outputs(target, stems)
     first: dict[str, str] = {}
@@ -159,8 +146,7 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
             raise PipelineError(
                 "two inputs have the same name and would be written to one file",
                 found=f"{other} and {source}: {output}",
-                cure="Name a folder (with a slash at its end), which keeps the inputs' folders; or "
-                "rename one",
+                cure="Give each folder of inputs a folder of outputs; or rename one",
             )
     return outputs
 

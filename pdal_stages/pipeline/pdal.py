@@ -7,7 +7,6 @@ python-pdal's classes, ``plugin/install.py`` looks for PDAL's library and header
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import logging
@@ -28,7 +27,7 @@ from typing import Any, TypeVar
 from ..base.errors import DependencyError, PipelineError
 from ..base.las import geotiff_code, header_there, named_copc, named_las, source_id
 from ..base.las_check import CURE_OF_DAMAGE, check_readable
-from ..base.las_repair import LARGEST_HEAD, corrected, overwritten
+from ..base.las_repair import LARGEST_HEAD, corrected
 from .inputs_outputs import readers_files, writers_outputs
 
 INSTALL = (
@@ -106,11 +105,9 @@ def drivers() -> list[dict[str, Any]]:
 
 
 def reader_of(source: str, tag: str) -> dict[str, Any]:
-    """Return a reader that reads extra dimensions of LAS 1.0-1.3 too, which PDAL leaves out."""
-    stage: dict[str, Any] = {"filename": str(source), "tag": tag}
-    if named_las(source) and not named_copc(source):
-        stage |= {"type": "readers.las", "use_eb_vlr": True}
-    return with_types([stage])[0]
+    """Return the reader of a file."""
+    plain = {"type": "readers.las"} if named_las(source) and not named_copc(source) else {}
+    return with_types([{"filename": str(source), "tag": tag, **plain}])[0]
 
 
 def writer_of(target: str) -> dict[str, Any]:
@@ -126,6 +123,8 @@ def with_types(
     stages: Sequence[Any], where: Callable[[int], str] | None = None
 ) -> list[dict[str, Any]]:
     """Return stages as objects with the types that PDAL infers from file names.
+
+    Readers of LAS read extra dimensions of all versions.
 
     The name of a file alone is a reader, or as the last of several stages a writer. PipelineError
     where PDAL infers no type; `where` tells where a stage stands.
@@ -147,6 +146,8 @@ def with_types(
                 cure = "Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "
                 place = where(number) if where else None
                 raise PipelineError(what, where=place, found=name, cure=f'{cure}"{kind}s.las"')
+        if stage["type"] == "readers.las" and not stage.keys() & {"extra_dims", "ignore_vlr"}:
+            stage.setdefault("use_eb_vlr", True)  # else PDAL drops extra bytes of LAS 1.0-1.3
         out.append(stage)
     return out
 
@@ -242,17 +243,7 @@ def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execu
         metadata = pipeline.metadata  # text in older python-pdal, a dict in newer
     except (RuntimeError, ValueError, IndexError, OverflowError) as error:  # of C++
         keep_alive(stdout)
-        read = readers_files(stages, las=True)
-        if read and _CUT_POINTS.search(str(error)):
-            what, files = "the LAS file is damaged: its points cannot be decoded", ", ".join(read)
-            where = f"one of {files}" if len(read) > 1 else files
-            raise PipelineError(
-                what, where=where, found=str(error).strip(), cure=CURE_OF_DAMAGE
-            ) from None
         raise translate(str(error), log_lines(_log(pipeline))[-3:]) from None
-    except MemoryError:
-        cure = "Work in tiles (--tile), or read less, e.g. with filters.crop"
-        raise PipelineError("memory ran out", cure=cure) from None
     finally:
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout
@@ -332,6 +323,9 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         cure = "Install it into the Python that the plugin of filters.python was built for"
         what = "the Python that PDAL runs does not have pdal_stages"
         return DependencyError(what, found=lines[-1], cure=cure)
+    if _CUT_POINTS.search(text):
+        what = "the LAS file is damaged: its points cannot be decoded"
+        return PipelineError(what, found=one_line, cure=CURE_OF_DAMAGE)
     if "convert spatial reference" in text:
         return PipelineError(BROKEN_REFERENCE, found=one_line, cure=REFERENCE_CURE)
     if "Traceback (most recent call last)" in text:  # of a script; a list in older PDAL
@@ -399,12 +393,6 @@ def deferred_interrupts() -> Iterator[None]:
 
 # ---- what differs between versions ---------------------------------------------------------------
 
-#: Options of readers.copc that choose points: without it they cannot be granted.
-_COPC_OPTIONS = ("bounds", "polygon", "ogr", "resolution", "origin")
-#: Its others that readers.las of that PDAL lacks. They concern
-#: transfers (`requests`, `keep_alive`, `header`, `query`) and the reading of odd records.
-_COPC_TUNING = ("requests", "keep_alive", "header", "query", "vlr", "fix_dims", "srs_vlr_order")
-
 
 def for_this_version(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return stages that this PDAL knows: before 2.4 a COPC file is read as plain LAZ.
@@ -423,13 +411,7 @@ def for_this_version(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
         elif kind == "writers.ogr":
             stage = {"measure_dim": "Z", **stage}
         elif kind == "readers.copc":
-            if beyond := [name for name in stage if name in _COPC_OPTIONS]:
-                what = f"PDAL {dotted_version()} reads COPC files whole, not by {beyond[0]}"
-                cure = "Use PDAL 2.4 or later, or filters.crop after the reader"
-                name = str(stage.get("filename", ""))
-                raise PipelineError(what, where="readers.copc", found=name, cure=cure)
-            stage = {k: v for k, v in stage.items() if k not in _COPC_TUNING}
-            stage["type"] = "readers.las"
+            stage = {**stage, "type": "readers.las"}  # which refuses options to read a part
         else:
             codes = {geotiff_code(path) for path in readers_files([stage], las=True)}
             if len(codes) == 1 and "" not in codes:  # which that PDAL does not look at
@@ -499,22 +481,6 @@ def overlap_as_flag(dimensions: Any, metadata: Any) -> bool:
 def _point_formats(metadata: Any) -> list[int]:
     """Return the point data record formats of the files that were read, from PDAL's metadata."""
     return [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
-
-
-def overwritten_dimensions(metadata: Any) -> list[str]:
-    """Return the dimensions that a reader has overwritten with extra bytes.
-
-    `metadata` is a node, as filters.python has it.
-    """
-    nodes = metadata.get("children", []) if isinstance(metadata, dict) else []
-    values = {node["name"]: node["value"] for node in nodes if isinstance(node, dict)}
-    names = [name for node in nodes for name in overwritten_dimensions(node)]
-    for node in nodes if str(values.get("dataformat_id", "")).isdigit() else ():
-        record = {child["name"]: child["value"] for child in node.get("children", [])}
-        if (record.get("user_id"), str(record.get("record_id"))) == ("LASF_Spec", "4"):
-            data = base64.b64decode(record.get("data", ""))
-            names += overwritten(int(values["dataformat_id"]), data)
-    return names
 
 
 def _values(node: Any, name: str) -> list[Any]:

@@ -52,7 +52,9 @@ class _Family:
 
         make.__name__ = make.__qualname__ = name
         make.__signature__ = signature  # type: ignore[attr-defined]
-        make.__doc__ = _help(kind)
+        make.__doc__ = "\n".join(
+            [f"{kind.summary}.", *(f"{o.name}: {o.help}" for o in kind.all_options())]
+        )
         return make
 
     def __dir__(self):
@@ -69,20 +71,6 @@ def _signature(kind: type[Stage]) -> inspect.Signature:
     parameters = [make(name, make.POSITIONAL_OR_KEYWORD) for name in needed]
     parameters += [make(n, make.KEYWORD_ONLY, default=d) for n, d in by_name.items()]
     return inspect.Signature(parameters)
-
-
-def _help(kind: type[Stage]) -> str:
-    """Return a stage's docstring in Python."""
-    lines = [f"{kind.summary}.", "", "Parameters", "----------"]
-    for option in kind.all_options():
-        lines += [f"{option.name} : {option.kind}", f"    {option.help}"]
-    lines += [
-        "tag, inputs",
-        "    As for PDAL's stages",
-        "merge : bool",
-        "    False keeps views apart",
-    ]
-    return "\n".join(lines)
 
 
 def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.ExpandedStage):

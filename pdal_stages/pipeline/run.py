@@ -20,7 +20,7 @@ from ..base.las_check import check_complete, check_readable
 from ..base.octree_check import check_copc, check_ept
 from ..base.report import Report
 from ..stages.registry import stage_types
-from . import las_output, runtime
+from . import las_files, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand, fuse_scripts, stage_files
 from .inputs_outputs import (
@@ -244,10 +244,6 @@ class Pipeline:
             elif stage["type"] == "readers.copc" and pdal_env.knows_copc():
                 for path in readers_files([stage], las=True):
                     check_copc(path)
-        creates = {name for ours in self.expanded.ours for name in ours.stage.creates()}
-        restored = " ".join(str(s["dimensions"]) for s in stages if s["type"] == "filters.ferry")
-        creates = {name for name in creates if f"=>{name}" not in restored}
-        self.warnings += las_output.replaced(files, creates)
         if units := [ours.stage.horizontal_unit for ours in self.expanded.ours]:
             self.warnings += check_readers(stages, next(filter(None, units), ""))
 
@@ -305,17 +301,17 @@ def execute_whole(
     def finish(partial: Path, final: Path, number: int) -> None:
         every = counted and "where" not in writers[number] and "#" not in outputs[number]
         check_complete(partial, final, writers[number], result.count if every else None)
-        las_output.finish(partial, sources, plane_unit(stages, result.metadata))
+        las_files.finish(partial, sources, plane_unit(stages, result.metadata))
 
     with whole_files(*outputs, check=finish) as partials:
         run = with_outputs(stages, list(partials))
         for number, stage in enumerate(run):
             if is_writer(stage):
-                run[number] = las_output.uncompressed_writer(stage, run[:number])
+                run[number] = las_files.uncompressed_writer(stage, run[:number])
         with pdal_env.deferred_interrupts():
             result = pdal_env.execute(run, **options)
             pdal_env.check_interrupt()
-        compressed = las_output.compress(partials)
+        compressed = las_files.compress(partials)
         check()
     names = {str(path): final for path, final in zip(partials, outputs, strict=True)}
     return result, names | {old: names.get(new, new) for old, new in compressed.items()}

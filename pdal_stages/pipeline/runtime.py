@@ -202,14 +202,6 @@ def run_on_view(
     outs: dict[str, Any],
 ) -> Report:
     """Run a stage on one view; return its report."""
-    if titles := pdal_env.overwritten_dimensions(module.get("metadata")):
-        raise StageError(
-            "extra bytes are named like dimensions of LAS, so PDAL has overwritten these",
-            found=", ".join(titles),
-            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under "
-            'other names; or name them all yourself: readers.las with "ignore_vlr": '
-            '"LASF_Spec/4" and "extra_dims": "Name=type,..."',
-        )
     lent = ins.keys() - outs.keys() if isinstance(ins, dict) else frozenset()
     points = points_of(stage, context, module, ins, lent)
     for name in stage.reads():
@@ -339,15 +331,13 @@ class Callbacks:
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return the stages, with a check before those that crash old PDAL without ground."""
-        if not pdal_env.needs_ground_check():
-            return list(stages)
         out: list[dict[str, Any]] = []
         for stage in stages:
-            if stage["type"] in NEEDS_GROUND:
-                wired = {"inputs": stage["inputs"]} if "inputs" in stage else {}
+            if stage["type"] in NEEDS_GROUND and pdal_env.needs_ground_check():
+                stage = dict(stage)
+                wired = {"inputs": stage.pop("inputs")} if "inputs" in stage else {}
                 check = partial(_check_ground, place(stage["type"], stage.get("tag")))
                 out.append(self.filter(check, **wired))
-                stage = {key: value for key, value in stage.items() if key not in wired}
             out.append(stage)
         return out
 

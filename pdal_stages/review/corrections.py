@@ -18,8 +18,7 @@ from ..base.grid import places_among
 from ..base.las import named_copc
 from ..base.vector import Overlay, points_inside, polygons_of, reading, vector
 from ..classifier.input_dimensions import CHECKED
-from ..pipeline.las_chunks import can_read_chunks, laspy_header, read_chunks
-from ..pipeline.las_output import finish
+from ..pipeline.las_files import can_read_chunks, finish, laspy_header, read_chunks
 from ..pipeline.spatial_reference import reference_of_file
 
 #: Share of points without a partner beyond which two files hold different points: large enough for

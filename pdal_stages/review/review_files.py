@@ -26,7 +26,7 @@ from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD, find
 from ..pipeline.inputs_outputs import input_files
-from ..pipeline.las_chunks import can_read_chunks, read_columns
+from ..pipeline.las_files import can_read_chunks, read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.page import TABLE_ROWS, render

@@ -19,7 +19,6 @@ from ..base import las, las_check
 from ..base.errors import PipelineError, StageError
 from ..base.units import Units
 from ..pipeline.inputs_outputs import LAS_READERS, locations
-from ..pipeline.las_output import replaced
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
 from .jobs import fingerprint
 from .options import (
@@ -174,7 +173,6 @@ class Survey:
         #: Sizes and times of the files that stages read, at the start of the run.
         self._others = {path: stamp(path) for files in plan.files for path in files}
         self._read_headers()
-        self.messages += replaced(self.paths, plan.makes)
         #: What each of the writers writes of each input; empty where each tile is an output.
         self.outputs = outputs_for(plan, self.paths) if options.per == "file" else []
         self.unit = self._unit(plan, options.per)  #: meters per unit of the coordinates

@@ -23,7 +23,7 @@ from ..objects.results import Objects
 from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.json_source import Override
-from ..pipeline.las_chunks import read_columns
+from ..pipeline.las_files import read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
 from ..reports.object_layers import write_objects
@@ -31,7 +31,7 @@ from ..stages.write_objects import STRAIGHT, WriteObjects
 
 #: Stages whose options the commands accept for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
-#: Dimensions that are read of LAZ 1.4 (see :func:`.las_chunks.read_chunks`).
+#: Dimensions that are read of LAZ 1.4 (see :func:`.las_files.read_chunks`).
 _ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
 #: Meters; cells are not enlarged beyond this automatically: neighboring houses would merge.
 LARGEST_CELL = 4.0

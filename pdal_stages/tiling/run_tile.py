@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.grid import places_among
-from ..pipeline.las_output import REPLACED, check_writers
+from ..pipeline.las_files import check_writers
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
@@ -312,7 +312,7 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     """Return messages of a tile, the same words for every tile; none about files in `scratch`."""
     lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
     for text in pipeline.messages:
-        about_piece = text.startswith((scratch, REPLACED)) or NO_REFERENCE in text
+        about_piece = text.startswith(scratch) or NO_REFERENCE in text
         if about_piece:  # the input has its own message
             continue
         known = next((words for words in (NO_POLYGON_NEAR, NO_POINT_MATCHES) if words in text), "")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..base.files import whole_files
 from ..base.grid import begins_run
-from ..pipeline.las_chunks import laspy_header, read_chunks
+from ..pipeline.las_files import laspy_header, read_chunks
 from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource, digest_of
 from .options import Box, TileGrid, check_number

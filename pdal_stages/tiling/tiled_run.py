@@ -20,7 +20,7 @@ from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
 from ..pipeline.json_source import Override
-from ..pipeline.las_output import files_with_flags_to_split
+from ..pipeline.las_files import files_with_flags_to_split
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .inputs import CloudIndex, Survey

@@ -23,7 +23,7 @@ from ..classifier.model_description import FILE_NUMBER
 from ..classifier.training import reach, train
 from ..classifier.training_clouds import TiledCloud, TrainingCloud
 from ..classifier.training_options import TrainingOptions
-from ..pipeline import las_output
+from ..pipeline import las_files
 from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import is_las
@@ -329,7 +329,7 @@ def take_points(
             values = NewValues(values.kept, {**values.values, FILE_NUMBER: numbered})
         new.append(values)
     callbacks = Callbacks()
-    flags = las_output.files_with_flags_to_split(readers)
+    flags = las_files.files_with_flags_to_split(readers)
     stages, _ = read_with(callbacks, readers, new, flags)
     run = pdal_env.execute(stages)
     if not run.count:

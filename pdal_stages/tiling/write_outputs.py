@@ -19,10 +19,10 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las_check import check_complete
-from ..pipeline import las_output
+from ..pipeline import las_files
 from ..pipeline import pdal as pdal_env
 from ..pipeline.inputs_outputs import LAS_WRITERS
-from ..pipeline.las_chunks import laspy_header, read_chunks
+from ..pipeline.las_files import laspy_header, read_chunks
 from ..pipeline.run import execute_whole
 from ..pipeline.runtime import Callbacks
 from ..stages.points import class_counts
@@ -166,7 +166,7 @@ def run_tail(
         if not Path(scratch).is_dir():  # the run was killed, and another one may be writing here
             raise StageError("the run that this belonged to has ended", found=scratch)
 
-    flags = las_output.files_with_flags_to_split([*readers, *tail])
+    flags = las_files.files_with_flags_to_split([*readers, *tail])
     callbacks = Callbacks()
     stages, last = read_with(callbacks, readers, new, flags)
     stages.append({"type": "filters.merge", "inputs": [last]})
@@ -190,9 +190,7 @@ def read_with(
     for number, reader in enumerate(readers):
         stages.append({**reader, "tag": f"in{number}"})
         if flags and flags[number]:
-            splitter = las_output.flag_splitter(
-                [True], inputs=[f"in{number}"], tag=f"split{number}"
-            )
+            splitter = las_files.flag_splitter([True], inputs=[f"in{number}"], tag=f"split{number}")
             stages.append(splitter)
         last.append(stages[-1]["tag"])
     stages += _put(callbacks, new, last, [flags_in_classes(each["filename"]) for each in readers])
@@ -229,7 +227,7 @@ def with_dimensions(
     tail: list[dict[str, Any]], extra_dims: Mapping[str, str] | None, paths: list[str]
 ) -> list[dict[str, Any]]:
     """Return a tail whose LAS writers list extra dimensions: the inputs' and `extra_dims`."""
-    listed = "" if extra_dims is None else las_output.extra_dims_option(paths, extra_dims)
+    listed = "" if extra_dims is None else las_files.extra_dims_option(paths, extra_dims)
     return [
         {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
         for stage in tail

@@ -31,7 +31,7 @@ REFUSED = {
     "number beyond a double": (b'["a.las",\n{"type": "filters.range", "limits": 1e999}]', ["line 2", "float"]),
     "whole number of 5,000 digits": (b'[{"type": "filters.hag_minima", "cell": ' + b"9" * 5000 + b"}]", ["not valid JSON"]),
     "comment that does not end": (b'["a.las", /* b\n"c.las"]', ["line 1", "does not end"]),
-    "half a surrogate pair": (b'["a.las",\n"\\ud800.las"]', ["line 2", "not valid UTF-8"]),
+    "half a surrogate pair": (b'["a.las",\n"\\ud800.las"]', ["line 2", "surrogates not allowed"]),
     "NUL in a name": (b'["a\\u0000.las", "b.las"]', ["line 1", "NUL"]),
     "a point cloud": (b"LASF\xff", ["a point cloud, not a pipeline"]),
     "Latin-1 text": ('["Gr\u00fcn.las"]'.encode("latin-1"), ["not UTF-8", "byte 4 is 0xfc", "Save it as UTF-8"]),
