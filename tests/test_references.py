@@ -326,13 +326,12 @@ def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, wri
     assert 3 < np.percentile(written.HeightAboveGround, 99) < np.ptp(z)
 
 
-@pytest.mark.parametrize(("slope", "top"), [(0.0, 40.0), (0.7, 26.0)])
-def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las, slope, top):
-    """A wood of 40 m in feet, or low woods on a slope; with a reference that names the heights' system all is well."""
+def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las):
+    """A wood of 40 m in feet; with a reference that names the heights' system all is well."""
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 60, (2, 40_000))
     wood = (np.arange(40_000) % 4 > 0) & (np.hypot(x - 30, y - 30) < 25)
-    z = (np.where(wood, rng.uniform(0.6 * top, top, 40_000), 0.0) + slope * (x + y)) / FOOT
+    z = np.where(wood, rng.uniform(24, 40, 40_000), 0.0) / FOOT
     returns = {"ReturnNumber": np.where(wood, 1, 2), "NumberOfReturns": np.full(40_000, 2)}
     source = write_las(tmp_path / "in.las", {"X": x + 5e5, "Y": y + 5e6, "Z": z, **returns}, 1)
     referenced(source, {3072: 26910})

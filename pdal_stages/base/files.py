@@ -34,45 +34,31 @@ CHECKPOINT = "a training's checkpoint"
 JSON = "a JSON file"
 HTML = "an HTML page"
 PNG = "a PNG picture"
-#: The first bytes of files that must not be replaced by another kind.
-_BEGINNINGS = {
-    b"LASF": LAS,
-    b"\x89PNG": PNG,
-    b"ply\n": "a PLY file",
-    b"ply\r": "a PLY file",
-    b"BPF!": "a BPF file",
-    b"II*\0": "a TIFF file",
-    b"MM\0*": "a TIFF file",
-    b"SQLite format 3\0": "an SQLite or GeoPackage file",
-    b"%PDF": "a PDF file",
-    b"\x7fELF": "a program",
-    b"#!": "a program",
-    b"\x1f\x8b": "a gzip archive",
-}
+#: A file with content of no kind above.
+_OTHER = "a file of another kind"
 
 
 def kind_of(path: str | os.PathLike) -> str:
-    """Return the kind of a file in words; empty for an unknown kind, an empty or a missing file."""
+    """Return the kind of a file in words; empty for an empty or a missing file."""
     try:
         with open(path, "rb") as file:
             head = file.read(512)
     except OSError:
         return ""
-    for beginning, kind in _BEGINNINGS.items():
-        if head.startswith(beginning):
-            return kind
+    if head.startswith((b"LASF", b"\x89PNG")):
+        return LAS if head.startswith(b"LASF") else PNG
     if head.startswith(b"PK\x03\x04"):  # its first file's name: length at 26, text from 30
         first = head[30 : 30 + int.from_bytes(head[26:28], "little")]
         known = {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}
-        return known.get(first, "a zip archive")
+        return known.get(first, _OTHER)
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if text.startswith((b"<!doctype html", b"<html")):
         return HTML
-    return JSON if text.startswith((b"{", b"[")) else ""
+    if text.startswith((b"{", b"[")):
+        return JSON
+    return _OTHER if head else ""
 
 
-#: Kind of a written file of no known kind: it equals none, so that it replaces no known one.
-_UNKNOWN = "a file of another kind"
 #: The longest file name, in bytes, on common file systems.
 _LONGEST_NAME = 255
 #: The most links that Linux follows one after the other.
@@ -325,7 +311,7 @@ def whole_files(
         inside = False
         moves = [(*move, number) for number, place in enumerate(places) for move in place.written()]
         for partial, target, number in moves:
-            check_writable(target, what, kind_of(partial) or _UNKNOWN)
+            check_writable(target, what, kind_of(partial) or _OTHER)
             if check is not None:
                 check(partial, target, number)
         for partial, target, _ in moves:

@@ -171,8 +171,7 @@ def compact_keys(coordinates: npt.NDArray[np.float64], size: float) -> tuple[Int
     """Return keys of points' cells that are as small as the cloud allows, and offsets of neighbors.
 
     They serve sorting, not comparison between clouds: they count from the cloud's own first cell,
-    so that few bits are needed. Empty stretches of a cloud that would need more than 62 bits are
-    cut out.
+    so that few bits are needed.
 
     Parameters
     ----------
@@ -188,6 +187,11 @@ def compact_keys(coordinates: npt.NDArray[np.float64], size: float) -> tuple[Int
         other.
     offsets : (3,) or (9,) int64
         Added to a key, they give the middle cells of the lines of three around its cell.
+
+    Raises
+    ------
+    StageError
+        For a cloud so wide that keys would need more than 62 bits.
     """
     axes, n = _AXES[coordinates.shape[1]], len(coordinates)
     spans = np.array(
@@ -196,20 +200,13 @@ def compact_keys(coordinates: npt.NDArray[np.float64], size: float) -> tuple[Int
     first, last = cell_numbers(spans, size).T
     # One empty cell beside the last, so that no cell has neighbors at the other end of the grid.
     lengths = [int(length) + 2 for length in last - first]
-    numbers = None
-    if float(np.prod(np.array(lengths, float))) >= 2.0**62:
-        numbers = [_without_gaps(cell_numbers(coordinates[:, k], size)) for k in axes]
-        lengths = [int(number.max(initial=0)) + 2 for number in numbers]
+    _refuse_beyond(np.array([np.prod(np.array(lengths, float))]), 2**62)
     keys = np.empty(n, np.int64)
     for start in range(0, n, _BATCH):
         batch = slice(start, start + _BATCH)
         key: Any = 0
         for place, (k, length) in enumerate(zip(axes, lengths, strict=True)):
-            if numbers is None:
-                number = cell_numbers(coordinates[batch, k], size) - first[place]
-            else:
-                number = numbers[place][batch]
-            key = key * length + number
+            key = key * length + cell_numbers(coordinates[batch, k], size) - first[place]
         keys[batch] = key
     steps = [1]
     for length in lengths[1:]:
@@ -218,9 +215,3 @@ def compact_keys(coordinates: npt.NDArray[np.float64], size: float) -> tuple[Int
     for step in steps[:-1]:
         offsets = np.add.outer(offsets, np.array([-step, 0, step])).reshape(-1)
     return keys, np.sort(offsets)
-
-
-def _without_gaps(number: Integers) -> Integers:
-    """Return numbers of cells (n,) of which stretches without any are cut to one empty cell."""
-    occupied, place = np.unique(number, return_inverse=True)
-    return np.concatenate(([0], np.cumsum(np.minimum(np.diff(occupied), 2))))[place]

@@ -165,19 +165,6 @@ def _in_ascii(field: bytes) -> bytes:
     return plain.encode("ascii", "replace").ljust(len(field), b"\0")
 
 
-def restore_texts(path: str | os.PathLike, sources: Iterable[str | os.PathLike]) -> None:
-    """Give the header of an output its texts with accents back, in place, from the sources."""
-    for source in sources:
-        with open(source, "rb") as file, open(path, "r+b") as output:
-            for at, length in _HEADER_TEXTS:
-                file.seek(at)
-                output.seek(at)
-                text, now = file.read(length), output.read(length)
-                if text != now and _in_ascii(text).split(b"\0")[0] == now.split(b"\0")[0]:
-                    output.seek(at)
-                    output.write(text)
-
-
 def _describe_extra_bytes(head: bytearray, header: LasHeader, before: list[Record]) -> None:
     """Describe and name all extra bytes so that PDAL takes them, in the head of the file."""
     descriptions = [r for r in before if (r.user, r.number) == (b"LASF_Spec", 4)]

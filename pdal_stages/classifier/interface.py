@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
-from ..base.report import Report
+from ..base.messages import Report
 from ..features.point_grid import CellGrid
 
 #: The kind of a forest on features.

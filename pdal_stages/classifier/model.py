@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError, suggest
-from ..base.report import Report
+from ..base.messages import Report
 from ..features import FeaturePlan
 from ..features.cell_means import density
 from ..features.point_grid import check_xyz

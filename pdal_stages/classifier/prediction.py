@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ..base.asprs import GROUND
 from ..base.checks import Settings, setting
 from ..base.errors import OptionError
-from ..base.report import Report
+from ..base.messages import Report
 from ..features.point_grid import CellGrid, build_grid
 from ..features.voxels import Representatives
 from .calibration import ReliabilityLimits

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from ..base import checks
 from ..base.errors import DimensionError, StageError, suggest
+from ..base.messages import Report
 from ..base.progress import Progress
-from ..base.report import Report
 from ..base.threads import map_blocks, resolve_threads
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .point_grid import CellGrid, build_grid, check_xyz

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, StageError, suggest
 from ..base.files import check_outputs
+from ..base.messages import Report
 from ..base.progress import Progress
-from ..base.report import Report
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from ..stages.registry import stage_from

@@ -31,7 +31,6 @@ from ..base.las_repair import (
     MOST_ENTRIES,
     corrected,
     extra_dimensions,
-    restore_texts,
     restore_titles,
 )
 from ..stages.registry import stage_types
@@ -97,7 +96,6 @@ def finish(output: Path, sources: Iterable[str], unit: float | None = None) -> N
     if named_las(output):
         sources = list(sources)
         restore_titles(output, sources)
-        restore_texts(output, sources)
         if unit is not None:
             set_geotiff_unit(output, unit)
 

@@ -16,9 +16,8 @@ from typing import Any
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
 from ..base.las import refuse_pipe
-from ..base.las_check import check_complete, check_readable
-from ..base.octree_check import check_copc, check_ept
-from ..base.report import Report
+from ..base.las_check import check_complete, check_copc, check_ept, check_readable
+from ..base.messages import Report
 from ..stages.registry import stage_types
 from . import las_files, runtime
 from . import pdal as pdal_env

@@ -24,7 +24,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ..base.errors import InterruptedStage, StageError
-from ..base.report import Report
+from ..base.messages import Report
 from ..stages.base import WHOLE_CLOUD, Stage, StageContext
 from ..stages.points import Points
 from ..stages.preprocessing import NEEDS_GROUND

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 
 from ..base.version import __version__
+from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import SPLITS
 from ..stages.base import Stage
 from ..stages.options import Option
@@ -38,8 +39,13 @@ def header() -> str:
         "// Stages after which views stay as they are: one, or as many as the user wants.\n"
         f"const std::set<std::string> NOT_GATHERED_AFTER {{ {names} }};"
     )
+    same_version = " && ".join(
+        f"PDAL_VERSION_{part} == {number}"
+        for part, number in zip(("MAJOR", "MINOR", "PATCH"), pdal_env.version(), strict=True)
+    )
+    check = f'static_assert({same_version}, "PDAL\'s headers and library differ in their version");'
     return "\n".join(
-        [version, not_gathered, *options, "const Stage STAGES[] = {", *stages, "};", ""]
+        [check, version, not_gathered, *options, "const Stage STAGES[] = {", *stages, "};", ""]
     )
 
 

@@ -6,7 +6,6 @@ import contextlib
 import ctypes
 import importlib
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -119,7 +118,6 @@ class Pdal(NamedTuple):
 
     library: Path  #: the folder of its library
     headers: Path  #: the folder that holds ``pdal/``
-    version: str
 
 
 def compiler() -> list[str]:
@@ -138,20 +136,11 @@ def compiler() -> list[str]:
 
 
 def pdal() -> Pdal:
-    """Return PDAL's library and headers; DependencyError where they are missing or differ."""
-    library, version = _library_folder(), pdal_env.dotted_version()
+    """Return PDAL's library and headers; DependencyError where they are missing."""
+    library = _library_folder()
     for prefix in dict.fromkeys([*library.parents, Path(sys.prefix)]):
-        headers = prefix / "include"
-        if not (headers / "pdal" / "Filter.hpp").is_file():
-            continue
-        headers_version = _headers_version(headers)
-        if headers_version not in (version, ""):
-            raise DependencyError(
-                "PDAL's headers and library are of different versions",
-                found=f"{headers / 'pdal'}: {headers_version}, {library}: {version}",
-                cure="Install both from one place",
-            )
-        return Pdal(library, headers, version)
+        if (prefix / "include" / "pdal" / "Filter.hpp").is_file():
+            return Pdal(library, prefix / "include")
     raise DependencyError(
         "PDAL's headers are missing",
         found=f"no include/pdal beside {library}",
@@ -202,17 +191,6 @@ def _library_folder() -> Path:
         found=extension,
         cure=f"On this system the plugin cannot be built; {_STILL_WORK}",
     )
-
-
-def _headers_version(headers: Path) -> str:
-    """Return the version in PDAL's headers; empty where there is none."""
-    for name in ("pdal_features.hpp", "pdal_config.hpp"):
-        path = headers / "pdal" / name
-        text = path.read_text(errors="replace") if path.is_file() else ""
-        numbers = dict(re.findall(r"#define\s+PDAL_VERSION_(MAJOR|MINOR|PATCH)\s+(\d+)", text))
-        if len(numbers) == 3:
-            return f"{numbers['MAJOR']}.{numbers['MINOR']}.{numbers['PATCH']}"
-    return ""
 
 
 def _run(command: Sequence[str]) -> None:

@@ -31,6 +31,7 @@
 #include <pdal/StageFactory.hpp>
 #include <pdal/Writer.hpp>
 #include <pdal/io/BufferReader.hpp>
+#include <pdal/pdal_features.hpp>
 #include <pdal/util/ProgramArgs.hpp>
 
 #ifndef _WIN32

@@ -18,8 +18,7 @@ from ..accuracy.text import by_file, summary
 from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION, UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, whole_files
-from ..base.messages import plain
-from ..base.report import Report
+from ..base.messages import Report, plain
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
 from .apply_model import ApplyModel

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.hashing import hash_rows
-from ..base.report import Report
+from ..base.messages import Report
 from ..classifier.input_dimensions import CHECKED
 from .points import class_counts
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, OptionError, StageError
 from ..base.memory import release_pages
-from ..base.report import Report
+from ..base.messages import Report
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .options import Selection
 from .where_expression import Expression

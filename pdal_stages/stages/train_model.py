@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
-from ..base.report import Report
+from ..base.messages import Report
 from ..classifier import model_description
 from ..classifier.calibration import calibrate_on_base
 from ..classifier.class_map import ClassMap

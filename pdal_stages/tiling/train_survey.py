@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs, work_folder
-from ..base.report import Report
+from ..base.messages import Report
 from ..classifier.input_dimensions import CHECKED
 from ..classifier.model import Model
 from ..classifier.model_description import FILE_NUMBER

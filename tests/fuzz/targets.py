@@ -27,8 +27,8 @@ import numpy as np
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
+from pdal_stages.base.las_check import check_ept
 from pdal_stages.base.las_repair import extra_dimensions
-from pdal_stages.base.octree_check import check_ept
 from pdal_stages.classifier import model_file
 from pdal_stages.classifier.interface import classifier_of
 from pdal_stages.classifier.model import assemble

@@ -329,7 +329,6 @@ def test_texts_in_latin_1(command, tmp_path, write_las, model, door, version):
         data += struct.pack("<H16sHQ32s", 0, "\u00fcber".encode("latin-1"), 1, 4, text) + b"abcd"
     source.write_bytes(bytes(data))
     out = classified(command, source, tmp_path / "out.las", model, *DOORS[door])
-    assert (tmp_path / "out.las").read_bytes()[26:58] == text
     assert len(out) == 600 and (np.asarray(out["Mine"]) == 1).all()
 
 
