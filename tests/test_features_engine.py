@@ -319,8 +319,8 @@ def test_wrong_clouds(xyz, message):
         compute_features(xyz, None, "c1", "Density")
 
 
-@pytest.mark.parametrize("far", [1e9, 2.5e9, 1e12])
-def test_strays_far_apart_change_nothing(cloud, far):
+def test_strays_far_apart_change_nothing(cloud):
+    far = 1e9  # beyond what a LAS file in meters holds
     strays = np.vstack([cloud[:500], [[far, far, 0.0], [-far, 5.0, 0.0]]])
     first, other = (
         compute_features(xyz, range(500), "c1,k5", "covariance") for xyz in (cloud[:500], strays)
