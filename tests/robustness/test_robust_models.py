@@ -177,19 +177,6 @@ def test_names_that_command_a_terminal_or_pass_for_lines(command, tmp_path, clou
         )
 
 
-def test_figures_of_any_size(command, tmp_path, model):
-    for edit in (
-        lambda h, _: (
-            h["training"].update(huge=10**400),
-            h["passes"][0]["parameters"].update(trees=10**400),
-        ),
-        lambda h, _: h["training"].update(curve=[10**400]),
-    ):
-        done = command("model", repack(model, tmp_path / "odd.model", edit))
-        if done.code:
-            command.refused(done, "odd.model")
-
-
 # ---- preparations: what a model asks for before it ------------------------------------------------------------
 
 #: What would touch FILE; test_preparation.py has more.
