@@ -258,7 +258,7 @@ def test_feature_stage_and_pdal_filters(tmp_path, town_file):
     pipeline = [
         str(town_file),
         {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
-        {"type": "filters.range", "limits": "Intensity[150:]"},
+        {"type": "filters.range", "limits": "Intensity[300:]"},
         {
             "type": "filters.multiscalefeatures",
             "neighborhoods": "c1,k10",

@@ -149,12 +149,6 @@ class TownBlock:
             top = z + height
             self._ball(place, (radius, radius), z - 0.2 * height, top, self.draw(1.2, 2.2))
 
-    def hedge(self, place, half) -> None:
-        """Plant a clipped hedge."""
-        z = self.z(*place)
-        top = z + self.draw(0.9, 1.9)
-        self._add("box", place, half, z - 1.0, top, VEGETATION, LEAF, self.draw(1.8, 3.0))
-
     def car(self, place, half=(0.9, 2.1)) -> None:
         """Park a car."""
         z = self.z(*place)
@@ -169,7 +163,6 @@ class TownBlock:
                 self.house((a + half, b), (half, 4.6), eave, "gable", pitch)
                 a += 2 * half + self.draw(2.5, 4.5)
         for a in np.arange(4.0, LAND, 8.0):
-            self.hedge((a, LAND / 2), (0.4, LAND / 2 - 13.0))
             self.plant(int(self.draw() < 0.5), 2, 4, 9, (a + 1, 13, 6, LAND - 26))
 
     def _fill_villas(self) -> None:
@@ -182,7 +175,6 @@ class TownBlock:
                 self.house((a + side / 2, b + 10), half, self.draw(2.8, 6.2), roof)
                 self.house((a + 3, b + 5), (1.5, 2.7), 2.5, "flat")
                 self.plant(2, 6, 4, 12, (a + 2, b + 17, side - 4, 5))
-                self.hedge((a + side / 2, b + 0.8), (side / 2 - 1, 0.4))
 
     def _fill_halls(self) -> None:
         """Build halls and a parking lot with trees."""

@@ -135,7 +135,7 @@ def pulses_at(i: int, j: int, size: float, spacing: float) -> Pulses:
         column, line = (axis.ravel() for axis in np.meshgrid(column, line))
         mixed = column * 12.9898 + line * 78.233 + strip  # a pulse has one place in all blocks
         odd = np.sin(np.column_stack([mixed, mixed + 1.0])) * 43758.5453 % 1.0 - 0.5
-        xy = (np.column_stack([column, line]) + 0.6 * odd) * spacing
+        xy = (np.column_stack([column, line]) + odd) * spacing
         drift = np.column_stack([(middle - xy[:, 0]) / ALTITUDE, np.zeros(len(xy))])
         across = (column * spacing - middle + STRIP_SPACING) / (2 * STRIP_SPACING)  # 0 to 1
         time = GPS_START + strip * STRIP_SECONDS + (line + across) * spacing / SPEED
