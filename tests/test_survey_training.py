@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from test_training_scores import QUICK_WORDS, scene
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError
 from pdal_stages.cli import main
+from pdal_stages.tiling import train_survey
 from pdal_stages.tiling.train_survey import surveys_of
 
 
@@ -87,3 +89,28 @@ def test_it_is_said_that_there_is_no_score_and_what_to_label_next(tmp_path, writ
     assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS,
                  "--writers.classifiermodel.folds=0"]) == 0  # fmt: skip
     assert "no score" not in capsys.readouterr().err
+
+
+@pytest.mark.pdal
+def test_corrections_are_trained_on(tmp_path, write_las, capsys):
+    """Samples are drawn from what a person checked, and a place to draw from must hold some."""
+    points = scene(1)
+    points["Checked"] = (points["X"] < points["X"].mean()).astype(np.uint8)
+    cloud = str(write_las(tmp_path / "a.laz", points, point_format=6))
+    words = ["train", cloud, "--model", str(tmp_path / "m.model"), *QUICK_WORDS]
+    assert main(words) == 0
+    assert "were checked by a person" in "".join(capsys.readouterr())
+    (tmp_path / "m.model").unlink()
+    assert main([*words, "--writers.classifiermodel.where=Checked == 0"]) == 1
+    assert "no checked point lies inside 'where'" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.laz"]
+
+
+@pytest.mark.pdal
+def test_more_points_than_fit_into_memory_are_refused(tmp_path, write_las, capsys, monkeypatch):
+    for name in "ab":
+        write_las(tmp_path / f"{name}.laz", scene(1), point_format=6)
+    monkeypatch.setattr(train_survey, "free_memory", lambda: 1.5 * 400 * len(scene(1)["X"]))
+    words = ["train", str(tmp_path), "--model", str(tmp_path / "m.model"), *QUICK_WORDS]
+    assert main(words) == 1 and "do not fit into memory" in capsys.readouterr().err
+    assert main([*words, "--surveys"]) == 0  # one is read after the other

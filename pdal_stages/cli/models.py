@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..base.messages import print_messages
 from .parser import INPUTS, Parser, add_stage_options, stage_options
-from .tiled_runs import add_tile_sizes, sigterm_like_ctrl_c, tiling_options
+from .tiled_runs import sigterm_like_ctrl_c
 
 #: Options of ``writers.classifiermodel`` that ``train`` has flags for.
 _TRAINING_OPTIONS = (
@@ -29,7 +29,6 @@ def add_commands(parser: Parser) -> None:
     add_stage_options(add, "writers.classifiermodel", *_TRAINING_OPTIONS)
     surveys = "Files of one survey, north=north/*.laz; any other file counts as a survey by itself"
     add("--surveys", nargs="*", metavar="NAME=PATTERN", help=surveys)
-    add_tile_sizes(parser.commands["train"])
 
     what = "Compare classes with a reference"
     add = parser.command("accuracy", _accuracy, what, overrides=True, progress=True)
@@ -70,7 +69,6 @@ def _train(options: argparse.Namespace) -> None:
         options.model,
         options.overrides,
         stage_options(options, *_TRAINING_OPTIONS),
-        tiling_options(options),
         surveys,
         named=options.inputs,
     )

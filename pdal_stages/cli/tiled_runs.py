@@ -45,7 +45,12 @@ def run_files(options: argparse.Namespace) -> list[Output]:
 def add_tile_options(command: argparse.ArgumentParser, survey: bool = False) -> None:
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
     when = "Several inputs and large files are cut into tiles" if survey else "Run in tiles"
-    add = add_tile_sizes(command, f"{when} (docs/large-areas.md).")
+    add = command.add_argument_group("large areas", f"{when} (docs/large-areas.md).").add_argument
+    side = "Side of the tiles in the cloud's unit (default: auto)"
+    add("--tile", type=_tile_side, metavar="SIZE", help=side)
+    add("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
+    workers = "Worker processes, 0 for none (default: half the cores)"
+    add("--workers", type=int, metavar="N", help=workers)
     scheduler = "A running Dask scheduler, tcp://HOST:8786"
     add("--scheduler", default="", metavar="ADDRESS", help=scheduler)
     add("--per", choices=PER, default="file", help="One output per input file or per tile")
@@ -55,23 +60,6 @@ def add_tile_options(command: argparse.ArgumentParser, survey: bool = False) -> 
     add("--dry-run", action="store_true", help="Show tiles, memory and disk needed, then stop")
     report = "Write a report, .html or .json"
     add("--report", action="append", default=[], metavar="FILE", help=report)
-
-
-def add_tile_sizes(
-    command: argparse.ArgumentParser,
-    what: str = "Points that do not fit in memory are read in tiles, which give the same model.",
-) -> Callable:
-    """Add the flags that all runs in tiles share; return what adds more to their group.
-
-    They are all that ``train`` has, as its only output is a model.
-    """
-    add = command.add_argument_group("large areas", what).add_argument
-    side = "Side of the tiles in the cloud's unit (default: auto)"
-    add("--tile", type=_tile_side, metavar="SIZE", help=side)
-    add("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
-    workers = "Worker processes, 0 for none (default: half the cores)"
-    add("--workers", type=int, metavar="N", help=workers)
-    return add
 
 
 def _tile_side(text: str) -> float | str:

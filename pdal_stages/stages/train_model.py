@@ -50,7 +50,7 @@ class TrainModel(Stage, settings=TrainingOptions):
     type = "writers.classifiermodel"
     summary = "Train a classifier on the labeled points that reach it, and write one model file"
     source = "[B16] sections 3.3-4.2, [W18] section 4.3, [WM19] for alsnet"
-    instead_of_tiles = "Train with the command pdal-stages train, which takes surveys of any size"
+    instead_of_tiles = "Train without --tile, or with the command pdal-stages train"
     where_help = "Samples are drawn from the points inside; all points are neighbors"
     needs_points = "train on"
     filename: str = option("filename", None, "The model file to write", required=True)

@@ -259,9 +259,9 @@ def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) ->
     return BASE + max(points_read * TILE_POINT + STAGES, assembled, block)
 
 
-def fits_whole(points: int, memory: int | None, point: int = TILE_POINT) -> bool:
-    """Return whether a cloud fits into memory in one piece, at `point` bytes for each point."""
-    return BASE + STAGES + points * point <= (memory or free_memory() // 2)
+def fits_whole(points: int, memory: int | None) -> bool:
+    """Return whether a cloud fits into memory in one piece."""
+    return BASE + STAGES + points * TILE_POINT <= (memory or free_memory() // 2)
 
 
 def choose_tiles(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -85,9 +85,6 @@ class TilePlan:
     name: str  #: the pipeline's file, or another name of its source
     #: Created dimensions that LAS files get besides the input's own; None leaves it to the writer.
     extra_dims: dict[str, str] | None = None
-    #: Called with each tile's own results, the outputs and the temporary folder, in place of the
-    #: tail; returns a record of what was written.
-    takes: Callable[[list[Any], list[str], str], dict[str, Any]] | None = None
     #: Dimensions that our stages create and outputs hold, with PDAL's types; files without points
     #: get them, too.
     makes: dict[str, str] = field(default_factory=dict)

@@ -330,8 +330,6 @@ def write_tile(
     results = [result for result in results if result.piece.own_rows.size]
     if not results:
         return {"outputs": []}
-    if plan.takes is not None:
-        return plan.takes(results, outputs, scratch)
     sources = [result.piece.source.path for result in results]
     tail = with_dimensions(plan.tail, plan.extra_dims, sources)
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
