@@ -184,7 +184,7 @@ def spoiled(name, value, at=(0, 0)):
         (spoiled("sa1_1", np.nan), "finite"),
         ({"sa2_1": None}, "not those of its configuration"),
         ({"sa2_1": np.zeros((32, 9), np.float32)}, r"must be \(32, "),
-        ({"scores": np.zeros(3, np.float32)}, "2 axes"),
+        ({"scores": np.zeros(3, np.float32)}, "not a model"),
     ],
 )
 def test_hostile_weights_are_refused(weights, text, tmp_path):

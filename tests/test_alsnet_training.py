@@ -1,10 +1,7 @@
 """Training networks: PyTorch against NumPy, overfitting, resuming, transfer, held out ground."""
 
-import hashlib
 import importlib.util
-import io
-import os
-import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +13,6 @@ from hypothesis import strategies as st
 import pdal_stages
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.alsnet.batches import JITTER, THIN, Batches, augment, build_pyramid
-from pdal_stages.alsnet.configuration import Configuration, Level
 from pdal_stages.alsnet.training_data import (
     class_weights,
     cover,
@@ -26,7 +22,6 @@ from pdal_stages.alsnet.training_data import (
     select_batches,
 )
 from pdal_stages.base.errors import DependencyError, ModelError, OptionError
-from pdal_stages.base.files import CHECKPOINT, kind_of
 from pdal_stages.classifier.interface import PredictRequest
 
 needs_torch = pytest.mark.skipif(
@@ -183,7 +178,7 @@ def test_a_tiny_network_overfits_a_tiny_scene():
     model = fit(
         [TrainingCloud(xyz, labels)],
         dimensions=(),
-        points=600,
+        configuration=replace(TINY, points=600),
         epochs=25,
         learning_rate=0.01,
         augment=False,
@@ -192,47 +187,6 @@ def test_a_tiny_network_overfits_a_tiny_scene():
     assert np.mean(prediction.classification == labels) > 0.97
     curve = model.info["training"]["curve"]
     assert len(curve) == 25 and curve[-1]["loss"] < 0.3 * curve[0]["loss"]
-
-
-@needs_torch
-def test_resumed_training_equals_one_without_a_break(tmp_path):
-    """Dropout, momenta, learning rates and the choice of the best epoch included."""
-    xyz, labels, values = scene(2500, 40.0)
-    clouds = [TrainingCloud(xyz, labels, values)]
-    network = TINY.__class__(**{**TINY.__dict__, "dropout": 0.5})
-    setting = {"configuration": network, "validation": 0.25, "block_size": 6.0, "epochs": 4}
-    whole = fit(clouds, **setting)
-    path = str(tmp_path / "run.checkpoint")
-
-    from pdal_stages.alsnet import training
-
-    class Stop(Exception):
-        pass
-
-    save = training.NetworkTraining._save
-
-    def stop(self, where):
-        save(self, where)
-        if len(self.curve) == 2:
-            raise Stop
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training.NetworkTraining, "_save", stop)
-        with pytest.raises(Stop):
-            fit(clouds, checkpoint=path, **setting)
-    resumed = fit(clouds, checkpoint=path, **setting)
-    assert resumed.info["training"]["curve"] == whole.info["training"]["curve"]
-    for name, array in whole.algorithm.weights.items():
-        assert np.array_equal(array, resumed.algorithm.weights[name]), name
-    held = whole.info["training"]["held_out"]
-    assert held["mean_f1"] == max(row["mean_f1"] for row in whole.info["training"]["curve"])
-    with pytest.raises(ModelError, match=r"another training.*options"):
-        fit(clouds, checkpoint=path, **{**setting, "learning_rate": 0.5})
-    other = {name: np.asarray(column)[::-1] for name, column in values.items()}
-    with pytest.raises(
-        ModelError, match=r"another training.*data"
-    ):  # of the same places, other values
-        fit([TrainingCloud(xyz, labels, other)], checkpoint=path, **setting)
 
 
 @needs_torch
@@ -282,65 +236,3 @@ def test_transfer_from_something_else_is_refused(tmp_path):
     forest = Path(pdal_stages.__file__).parent / "models" / "standard.model"
     with pytest.raises(ModelError, match="network only"):
         fit(start_from=str(forest))
-
-
-# ---- checkpoints that lie ------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    """A checkpoint after one epoch, and what it takes to go on from it."""
-    pytest.importorskip("torch", reason="PyTorch is not installed (extra 'deep')")
-    path = tmp_path_factory.mktemp("checkpoint") / "a.checkpoint"
-    xyz, labels, values = scene(300, 8.0)
-    level = Level(8, 2.0, 4, (4,), (4,))
-    setting = {"configuration": Configuration("least", 64, (level,), head=(4,)), "epochs": 1}
-    clouds = [TrainingCloud(xyz, labels, values)]
-    fit(clouds, checkpoint=str(path), **setting)
-    assert kind_of(path) == CHECKPOINT
-    return path.read_bytes(), lambda path: fit(clouds, checkpoint=str(path), **setting)
-
-
-class _Runs:
-    """Whoever unpickles this runs a command."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.path}",)
-
-
-@needs_torch
-def test_checkpoints_that_lie_are_refused(checkpoint, tmp_path):
-    import torch
-
-    whole, go_on = checkpoint
-    path, touched = tmp_path / "a.checkpoint", tmp_path / "touched"
-    path.write_bytes(whole)
-    assert len(go_on(path).info["training"]["curve"]) == 1
-    state = torch.load(io.BytesIO(whole[:-32]), weights_only=True)
-
-    def refused(content):
-        path.write_bytes(content)
-        with pytest.raises(ModelError, match=r"checkpoint.*Delete"):
-            go_on(path)
-
-    for changed in (
-        {"identity": "another"},
-        {"network": {}},
-        {"network": _Runs(touched)},
-        {"best": [1]},
-    ):
-        buffer = io.BytesIO()
-        torch.save({**state, **changed}, buffer)
-        refused(buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
-    for content in (
-        b"",
-        b"nothing",
-        whole[:-30],
-        whole[:500] + b"\0" + whole[501:],
-        pickle.dumps({"a": 1}),
-    ):
-        refused(content)
-    assert not touched.exists()

@@ -3,70 +3,48 @@
 A configuration lists the levels of set abstraction [WM19; Qi et al. 2017, PointNet++]: how many
 centers are sampled, the radius of the ball around each, how many points are taken from it, the
 widths of the shared perceptron that describes the ball, and the widths of the one that carries
-features back up to the level above.
+features back up to the level above. The named ones are in networks.json: ``alsnet4`` and
+``alsnet3`` are those of [WM19]'s program, the others are ours, for CPUs.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from importlib import resources
 from typing import Any
 
 from ..base import checks
 from ..base.checks import Settings, setting
-from ..base.errors import OptionError, suggest
+from ..base.errors import OptionError
 
-#: A configuration's largest number of layers, each an array; a model file may hold 95 arrays.
-MAX_LAYERS = 60
-
-
-def _widths(what: str, value: Any) -> tuple[int, ...]:
-    if not isinstance(value, list | tuple) or not 1 <= len(value) <= 8:
-        raise OptionError(f"{what} must be a list of 1 to 8 widths", found=repr(value)[:60])
-    return tuple(checks.whole(what, width, 1, 4096) for width in value)
+_FILE = json.loads(resources.files(__package__).joinpath("networks.json").read_text("utf-8"))
 
 
 @dataclass(frozen=True)
-class Level(Settings):
-    """One level of set abstraction and the feature propagation back from it."""
+class Level:
+    """One level of set abstraction and the feature propagation back from it.
 
-    centers: int = setting(MISSING, "integer", "Points kept by farthest point sampling", 1, 10**7)
-    radius: float = setting(
-        MISSING, "number", "Radius of the ball around each center, meters", 1e-3, 1e4
-    )
-    samples: int = setting(MISSING, "integer", "Points taken from a ball", 1, 1024)
-    mlp: tuple[int, ...] = setting(
-        MISSING, "numbers", "Layer widths before max pooling", check=_widths
-    )
-    up: tuple[int, ...] = setting(
-        MISSING, "numbers", "Layer widths after interpolation", check=_widths
-    )
+    What each value means is in the schema of networks.json.
+    """
+
+    centers: int
+    radius: float
+    samples: int
+    mlp: tuple[int, ...]
+    up: tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class Configuration(Settings):
+class Configuration:
     """A whole network, but for the number of inputs and classes."""
 
     name: str
-    points: int = setting(
-        MISSING, "integer", "Points of a batch: the nearest around a grid point", 16, 10**7
-    )
-    levels: tuple[Level, ...] = ()
-    head: tuple[int, ...] = setting((128,), "numbers", "Layer widths before dropout", check=_widths)
-    dropout: float = setting(
-        0.5, "number", "Share of the head's outputs left out in training", 0.0, 0.95
-    )
-
-    def __post_init__(self) -> None:
-        """Check what cannot be declared."""
-        super().__post_init__()
-        if not isinstance(self.name, str) or not 1 <= len(self.name) <= 60:
-            raise OptionError("a configuration's name must be text", found=repr(self.name)[:60])
-        if not 1 <= len(self.levels) <= 8:
-            raise OptionError("a network must have 1 to 8 levels", found=len(self.levels))
-        if (layers := len(self.shapes(1, 1))) > MAX_LAYERS:
-            raise OptionError(f"a network may have {MAX_LAYERS} layers", found=layers)
+    points: int
+    levels: tuple[Level, ...]
+    head: tuple[int, ...] = (128,)
+    dropout: float = 0.5
 
     def _linear(self, inputs: int) -> Iterator[tuple[str, int, int, int, int]]:
         """Yield name, rows, inputs, outputs and depth below of every layer but the last.
@@ -122,109 +100,36 @@ class Configuration(Settings):
         return json.loads(json.dumps(asdict(self)))  # lists for tuples
 
 
-def parse_configuration(
-    source: str | Mapping[str, Any] | Configuration, points: int | None = None
-) -> Configuration:
+def parse_configuration(source: Any) -> Configuration:
     """Return a configuration by its name or from data; OptionError for others.
-
-    `points` of a batch replace its own.
 
     A mapping has ``points``, ``levels`` (each ``centers``, ``radius``, ``samples``, ``mlp``,
     ``up``) and optionally ``name``, ``head``, ``dropout``.
     """
+    if isinstance(source, Configuration):
+        return source
     if isinstance(source, str):
-        if source not in CONFIGURATIONS:
-            raise OptionError(
-                "the network configuration is not known",
-                found=repr(source)[:60],
-                cure=f"{suggest(source, CONFIGURATIONS)}Choose one of {', '.join(CONFIGURATIONS)}",
-            )
-        configuration = CONFIGURATIONS[source]
-    elif isinstance(source, Configuration):
-        configuration = source
-    elif isinstance(source, Mapping):
-        configuration = _from_mapping(source)
-    else:
-        raise OptionError("a configuration must be a name or a mapping", found=repr(source)[:60])
-    return configuration if points is None else replace(configuration, points=points)
+        checks.one_of("'configuration'", source, _FILE["networks"])
+        source = {"name": source, **_FILE["networks"][source]}
+    from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import best_match
 
-
-def _from_mapping(source: Mapping[str, Any]) -> Configuration:
-    _only(source, Configuration, "a network configuration", ("points", "levels"))
-    if not isinstance(source["levels"], list | tuple):
-        raise OptionError("'levels' must be a list", found=repr(source["levels"])[:60])
-    levels = []
-    for level in source["levels"][:9]:
-        _only(level, Level, "a level", [each.name for each in fields(Level)])
-        levels.append(Level(**level))
-    return Configuration(**{"name": "own", **source, "levels": tuple(levels)})
-
-
-def _only(source: Any, kind: type, what: str, needed: Sequence[str] = ()) -> None:
-    """Raise an OptionError for what is not a mapping of a dataclass's fields."""
-    if not isinstance(source, Mapping):
-        raise OptionError(f"{what} must be a mapping", found=repr(source)[:60])
-    known = [each.name for each in fields(kind)]
-    for name in source:
-        if name not in known:
-            raise OptionError(
-                f"{what} has no '{str(name)[:40]}'",
-                cure=f"{suggest(str(name), known)}It may have: {', '.join(known)}",
-            )
-    for name in needed:
-        if name not in source:
-            raise OptionError(f"{what} needs '{name}'")
-
-
-#: The named ones. ``alsnet4`` and ``alsnet3`` are those of [WM19]'s program; the others are ours,
-#: for CPUs.
-CONFIGURATIONS = {
-    name: Configuration(name, points, tuple(Level(*row) for row in levels), head)
-    for name, points, head, levels in (
-        (
-            "alsnet4", 200_000, (128,), (
-                (8192, 1.0, 16, (64, 128, 128), (128, 64)),
-                (4096, 2.0, 16, (128, 256, 256), (256, 256)),
-                (2048, 5.0, 16, (128, 256, 256), (256, 256)),
-                (512, 15.0, 32, (128, 512, 256), (256, 256)),
-            ),
-        ),
-        (
-            "alsnet3", 200_000, (128,), (
-                (16384, 1.0, 32, (128, 128, 128), (128, 128)),
-                (8192, 5.0, 64, (128, 128, 256), (256, 256)),
-                (4096, 15.0, 64, (128, 128, 256), (256, 256)),
-            ),
-        ),
-        (
-            "small", 16_384, (64,), (
-                (2048, 1.0, 16, (32, 32, 64), (64, 64)),
-                (512, 2.5, 16, (64, 64, 128), (128, 64)),
-                (128, 6.0, 16, (128, 128, 256), (128, 128)),
-            ),
-        ),
-        (
-            "tiny", 2048, (32,), (
-                (256, 1.5, 8, (16, 16, 32), (32, 32)),
-                (64, 4.0, 8, (32, 32, 64), (32, 32)),
-            ),
-        ),
-    )
-}  # fmt: skip
-
-
-def _file(what: str, value: Any) -> str:
-    if not isinstance(value, str):
-        raise OptionError(f"{what} must be a file name", found=repr(value))
-    return value
+    if error := best_match(Draft202012Validator(_FILE["schema"]).iter_errors(source)):
+        where = "".join(f"[{part!r}]" for part in error.path)
+        raise OptionError(f"the network's configuration{where}: {error.message[:200]}")
+    levels = [
+        Level(**{**level, "mlp": tuple(level["mlp"]), "up": tuple(level["up"])})
+        for level in source["levels"]
+    ]
+    head = tuple(source.get("head", Configuration.head))
+    return Configuration(**{"name": "own", **source, "levels": tuple(levels), "head": head})
 
 
 @dataclass(frozen=True)
 class NetworkOptions(Settings):
     """Options of training a network; docs/alsnet.md says more of each."""
 
-    configuration: Any = "small"  #: the name of one of :data:`CONFIGURATIONS`, or one of your own
-    points: int | None = None  #: of a batch, instead of the configuration's
+    configuration: Any = "small"  #: a name of networks.json, or one of your own
     spacing: float | None = setting(
         None, "number", "Spacing of batches, m; default: four a point", 0.01, 1e5
     )
@@ -256,22 +161,20 @@ class NetworkOptions(Settings):
     patience: int = setting(
         20, "integer", "Maximum epochs without a better mean F1; 0: no limit", 0, 100_000
     )
-    checkpoint: str | None = setting(
-        None, "filename", "Written each epoch; resumed from", check=_file
-    )
     #: classes it shares keep their weights, others start afresh
-    start_from: str | None = setting(None, "filename", "Model file to start from", check=_file)
+    start_from: str | None = setting(None, "filename", "Model file to start from")
     device: str = setting("auto", "string", "Device to train on", choices=("auto", "cpu", "cuda"))
 
     def __post_init__(self) -> None:
         """Check all options, and parse the configuration."""
         super().__post_init__()
-        object.__setattr__(
-            self, "configuration", parse_configuration(self.configuration, self.points)
-        )
+        object.__setattr__(self, "configuration", parse_configuration(self.configuration))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> NetworkOptions:
         """Return options by name; OptionError for an unknown name."""
-        _only(values, cls, "'alsnet'")
+        if not isinstance(values, Mapping):
+            raise OptionError("'alsnet' must be a mapping of options", found=repr(values)[:60])
+        for name in values:
+            checks.one_of("an option in 'alsnet'", name, [each.name for each in fields(cls)])
         return cls(**values)

@@ -1,19 +1,15 @@
-"""The network in PyTorch, for training it and applying it on a GPU, and its checkpoints."""
+"""The network in PyTorch, for training it and applying it on a GPU."""
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable, Mapping
-from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.errors import DependencyError, ModelError, optional_import
-from ..base.files import write_whole
+from ..base.errors import DependencyError, optional_import
 from .batches import Pyramid, Step
 from .configuration import Configuration
 from .network import EPSILON, Weights, forward
@@ -26,11 +22,6 @@ nn: Any = torch.nn
 
 #: Share of a batch's statistics in the running ones (PyTorch's default is 0.1; not tuned).
 MOMENTUM = 0.05
-#: First part of what a checkpoint must agree with; changes with what is stored.
-CHECKPOINT_FORMAT = "pdal-stages alsnet checkpoint 4"
-#: Bytes of the SHA-256 at the end.
-_DIGEST = 32
-_CURE = "Delete the checkpoint to begin anew, or name another file"
 
 
 class Network(nn.Module):
@@ -133,35 +124,3 @@ def tensors(pyramid: Pyramid, device: str = "cpu") -> Pyramid:
         for s in pyramid.steps
     )
     return Pyramid(move(pyramid.inputs), tuple(steps))
-
-
-def save_checkpoint(path: str, state: dict[str, Any]) -> None:
-    """Write the state of a training; ``state["identity"]`` tells which training it is of."""
-    buffer = BytesIO()
-    torch.save(state, buffer)
-    write_whole(path, buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
-
-
-def resume_checkpoint(path: str, identity: str, apply: Callable[[dict[str, Any]], None]) -> None:
-    """Read the state of a training and `apply` it. Nothing in the file is executed.
-
-    ModelError where it is damaged, or the state of a training of another `identity`.
-    """
-    data = Path(path).read_bytes()
-    if hashlib.sha256(data[:-_DIGEST]).digest() != data[-_DIGEST:]:
-        raise ModelError("the checkpoint is damaged or of another release", where=path, cure=_CURE)
-    try:
-        state = torch.load(BytesIO(data[:-_DIGEST]), map_location="cpu", weights_only=True)
-        fits = state["identity"] == identity
-        if fits:
-            apply(state)
-    except Exception as error:  # PyTorch's own, of files that somebody made
-        raise ModelError(
-            "the checkpoint cannot be read",
-            where=path,
-            found=f"{type(error).__name__}: {error}".splitlines()[0][:200],
-            cure=_CURE,
-        ) from error
-    if not fits:
-        what = "the checkpoint belongs to another training, of other options, classes or data"
-        raise ModelError(what, where=path, cure=_CURE)

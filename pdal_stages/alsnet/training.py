@@ -1,8 +1,7 @@
-"""Training alsNet: epochs of selected batches, scored on ground held out, resumable [WM19 3, 4]."""
+"""Training alsNet: epochs of selected batches, scored on ground held out [WM19 3, 4]."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Sequence
@@ -13,8 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
-from ..base.files import CHECKPOINT, Output
-from ..base.hashing import hash_rows
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.class_map import ClassMap
@@ -22,7 +19,7 @@ from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
-from .batches import SHIFT, Pyramid, join_pyramids
+from .batches import SHIFT, Pyramid
 from .classifier import AlsNet
 from .configuration import NetworkOptions
 from .network import Weights, check_weights, initial_weights
@@ -33,12 +30,6 @@ from .training_data import TrainingData, class_weights, cover, select_batches
 LAST_RATE = 0.01
 
 optional_inputs: dict[str, tuple[str, ...]] = {}
-
-
-def outputs(options: TrainingOptions) -> list[Output]:
-    """Return the checkpoint, if one is wanted."""
-    path = options.alsnet.checkpoint
-    return [Output(path, "checkpoint", CHECKPOINT)] if path else []
 
 
 def own_options(options: Any) -> NetworkOptions:
@@ -121,17 +112,12 @@ class NetworkTraining:
         self.best_epoch = 0
 
     def run(self, progress: bool) -> AlsNet:
-        """Train all epochs, or those that a checkpoint has left; return the best network."""
+        """Train all epochs; return the best network."""
         options, data = self.options, self.data
-        if options.checkpoint and os.path.exists(options.checkpoint):
-            self._resume(options.checkpoint)
-        left = max(options.epochs - len(self.curve), 0)
-        total = left * (len(self.selected) + len(self.held_batches))
+        total = options.epochs * (len(self.selected) + len(self.held_batches))
         with Progress(total, "training alsNet", "batches", enabled=progress) as bar:
             while len(self.curve) < options.epochs and not self._patience_is_over():
                 self._run_epoch(bar)
-                if options.checkpoint:
-                    self._save(options.checkpoint)
         check_weights(self.best, options.configuration, len(data.inputs), data.n_classes)
         return AlsNet(
             self.best,
@@ -178,17 +164,17 @@ class NetworkTraining:
         self.network.train()
         total, weight = 0.0, 0
 
-        def prepare(numbers: list[int]) -> tuple[int, Pyramid, npt.NDArray[np.int64]]:
-            parts = [self._augmented_batch(self.selected[k], epoch) for k in numbers]
-            labels = np.concatenate([labels for _, labels in parts])
-            return len(numbers), join_pyramids([pyramid for pyramid, _ in parts]), labels
+        def prepare(numbers: list[int]) -> list[tuple[Pyramid, npt.NDArray[np.int64]]]:
+            return [self._augmented_batch(self.selected[k], epoch) for k in numbers]
 
-        for count, pyramid, labels in map_blocks(prepare, steps, self.threads):
-            known = int(np.count_nonzero(labels >= 0))
-            if known and len(labels) > 1:
-                total += self._step(pyramid, labels) * known
+        for numbers, parts in zip(steps, map_blocks(prepare, steps, self.threads), strict=True):
+            # A single point has no variance to be normalized by.
+            parts = [(pyramid, labels) for pyramid, labels in parts if len(labels) > 1]
+            known = sum(int(np.count_nonzero(labels >= 0)) for _, labels in parts)
+            if known:
+                total += self._step(parts) * known
                 weight += known
-            bar.update(count)
+            bar.update(len(numbers))
         return total / weight if weight else 0.0
 
     def _augmented_batch(self, number: int, epoch: int) -> tuple[Pyramid, npt.NDArray[np.int64]]:
@@ -205,13 +191,13 @@ class NetworkTraining:
         rows, pyramid = data.pyramid(members, center, random if self.options.augment else None)
         return pyramid, data.train_labels[rows]
 
-    def _step(self, pyramid: Pyramid, labels: npt.NDArray[np.int64]) -> float:
+    def _step(self, parts: list[tuple[Pyramid, npt.NDArray[np.int64]]]) -> float:
         """Do a step of the optimizer; return the cross entropy, the loss [WM19 2.4]."""
         torch = self.torch
-        scores = self.network(self.backend.tensors(pyramid, self.device))
-        target = torch.from_numpy(labels).to(self.device)
+        scores = [self.network(self.backend.tensors(pyramid, self.device)) for pyramid, _ in parts]
+        target = torch.from_numpy(np.concatenate([labels for _, labels in parts])).to(self.device)
         loss = torch.nn.functional.cross_entropy(
-            scores, target, weight=self.weight, ignore_index=-1
+            torch.cat(scores), target, weight=self.weight, ignore_index=-1
         )
         value = float(loss.detach())
         if not math.isfinite(value):
@@ -245,48 +231,10 @@ class NetworkTraining:
         np.add.at(matrix, (labels[rows], sums[rows].argmax(axis=1)), 1)
         return figures(matrix, data.labeled.classes.codes)
 
-    def _identity(self) -> str:
-        """Return what a checkpoint must agree with, as JSON: options, classes and data."""
-        options, data = asdict(self.options), self.data
-        for free in ("epochs", "patience", "device", "checkpoint"):
-            options.pop(free)
-        options["start_from"] = options["start_from"] and os.path.basename(options["start_from"])
-        classes = data.labeled.classes
-        labels = [list(classes.codes), [list(part) for part in classes.labels]]
-        values = (*data.xyz.T, *data.columns.T, data.position)
-        digest = [*map(len, data.labeled.clouds), str(hash_rows(values, 0).sum())]
-        return json.dumps(
-            [self.backend.CHECKPOINT_FORMAT, options, self.seed, data.inputs, labels, digest]
-        )
-
-    def _save(self, path: str) -> None:
-        """Write all that training changes."""
-        best = {name: self.torch.from_numpy(array) for name, array in self.best.items()}
-        state = {
-            "identity": self._identity(),
-            "curve": self.curve,
-            "best_epoch": self.best_epoch,
-            "best": best,
-            "network": self.network.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-        }
-        self.backend.save_checkpoint(path, state)
-
-    def _resume(self, path: str) -> None:
-        """Go on from a checkpoint of the same training."""
-
-        def apply(state: dict[str, Any]) -> None:
-            self.network.load_state_dict(state["network"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            self.best = {name: tensor.numpy() for name, tensor in state["best"].items()}
-            self.curve, self.best_epoch = state["curve"], state["best_epoch"]
-
-        self.backend.resume_checkpoint(path, self._identity(), apply)
-
     def describe(self) -> dict[str, Any]:
         """Return the manifest's entries: batches, epochs, curve, validation."""
         options, data = asdict(self.options), self.data
-        for name in ("configuration", "checkpoint", "start_from", "device", "points"):
+        for name in ("configuration", "start_from", "device"):
             options.pop(name)
         start, best = self.options.start_from, self._best_row()
         start = start and os.path.basename(start)

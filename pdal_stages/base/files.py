@@ -30,7 +30,6 @@ from .errors import StageError
 
 LAS = "a LAS or LAZ file"
 MODEL = "a model file"
-CHECKPOINT = "a training's checkpoint"
 JSON = "a JSON file"
 HTML = "an HTML page"
 PNG = "a PNG picture"
@@ -49,8 +48,7 @@ def kind_of(path: str | os.PathLike) -> str:
         return LAS if head.startswith(b"LASF") else PNG
     if head.startswith(b"PK\x03\x04"):  # its first file's name: length at 26, text from 30
         first = head[30 : 30 + int.from_bytes(head[26:28], "little")]
-        known = {b"manifest.json": MODEL, b"archive/data.pkl": CHECKPOINT}
-        return known.get(first, _OTHER)
+        return MODEL if first == b"manifest.json" else _OTHER
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if text.startswith((b"<!doctype html", b"<html")):
         return HTML

@@ -117,7 +117,6 @@ def register_kind(name: str, classifier: Callable[[], Any], trainer: Callable[[]
       dimensions that it is computed from;
     - ``own_options(options)``: the checked options that only this kind has, or None;
     - ``inputs(options)``: the dimensions that the classifier will read;
-    - ``outputs(options)``: the files that training writes beside the model;
     - ``train(clouds, options, progress)``: a ``Model``, trained on clouds that are prepared.
     """
     _kinds[name] = classifier, trainer

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, OptionError
-from ..base.files import Output
 from ..base.memory import free_memory
 from ..base.progress import Progress
 from ..features import FeaturePlan
@@ -51,11 +50,6 @@ _STORED = (
 )
 
 optional_inputs = {**{name: (name,) for name in OPTIONAL_DIMENSIONS}, "returns": SOURCES}
-
-
-def outputs(options: TrainingOptions) -> list[Output]:
-    """Return no file: the model is the only one."""
-    return []
 
 
 def own_options(options: Any) -> None:

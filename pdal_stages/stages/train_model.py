@@ -178,7 +178,7 @@ class TrainModel(Stage, settings=TrainingOptions):
 
     def outputs(self) -> list[Output]:
         """Return the files that are written."""
-        return [Output(self.filename, "model", MODEL), *self._trainer.outputs(self.training)]
+        return [Output(self.filename, "model", MODEL)]
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
