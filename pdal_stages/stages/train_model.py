@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,12 +26,11 @@ from ..classifier.input_dimensions import (
 from ..classifier.interface import kinds, trainer_of
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import digest_of, find
-from ..classifier.train_forest import SHORT
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import RECIPES, TrainingOptions, describe_recipes, with_recipe
 from .base import Stage, StageContext, files_read
-from .checked_points import SURE, CheckedChoice, CheckedPoints
+from .checked_points import select_checked
 from .options import UNWANTED, Selection, declared_option, option
 from .points import Points
 from .preprocessing import check as check_preprocessing
@@ -197,14 +196,8 @@ class TrainModel(Stage, settings=TrainingOptions):
         names = [Path(name).name for name in self.files]
         return ", ".join([*names[:_NAMED], *["..."] * (len(names) > _NAMED)]) or "the points"
 
-    def cloud_of(
-        self, points: Points, training: TrainingOptions, marks: Mapping[str, NDArray] | None = None
-    ) -> TrainingCloud:
-        """Return the points as a cloud to train on.
-
-        With `marks` these are dimensions, too, and samples are selected later; without, the mask of
-        the cloud selects them.
-        """
+    def cloud_of(self, points: Points, training: TrainingOptions) -> TrainingCloud:
+        """Return the points as a cloud to train on."""
         needed = required_dimensions((*training.inputs, *filter(None, [self.groups])))
         dimensions = {name: points.dimension(name) for name in needed}
         dimensions |= {
@@ -213,9 +206,9 @@ class TrainModel(Stage, settings=TrainingOptions):
         cloud = TrainingCloud(
             xyz=points.xyz,
             labels=points.codes_of(self.label),
-            dimensions=dimensions | dict(marks or {}),
+            dimensions=dimensions,
             name=self.named,
-            mask=self._mask(points) if marks is None else points.mask,
+            mask=self._mask(points),
         )
         # Class codes are left to the trainer: they may be labels.
         gone = points.ignored(replace(self.ignore, codes=()))
@@ -244,18 +237,10 @@ class TrainModel(Stage, settings=TrainingOptions):
         """Report the scores of a model, and samples that it cannot learn from."""
         shown = {key: model.info[key] for key in _SHOWN if key in model.info}
         report.figures |= {"model": self.filename, **shown}
-        threshold = getattr(model.passes[0].features, "copt_threshold", None)
-        if threshold is not None:
-            report.figures["copt_threshold"] = threshold
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
                 f"the base assigns {held:,} of {all_:,} samples of class {code} to classes "
                 "without labels, where they stay: label some of those classes too"
-            )
-        if short := model.info["training"].get(SHORT):
-            report.warnings.append(
-                f"{short:,} samples have neighbors farther away than their tile shows, and may "
-                "differ from those of a run in one piece: give more --memory"
             )
         if unscored := model.info["training"].get("unscored"):
             report.warnings.append(unscored)
@@ -269,29 +254,10 @@ class TrainModel(Stage, settings=TrainingOptions):
             report.figures["score"] = model_description.score(model.info)
             report.notes.append(report.figures["score"])
 
-    def choice(self, parts: Iterable[Mapping[str, Any]]) -> CheckedChoice:
-        """Return the selection of samples among checked points, from counts of all parts."""
-        known = None if self.base is None else loaded_model(self.base).codes.tolist()
-        return CheckedChoice(known, self.seed, parts)
-
-    def checked_points(self, points: Points) -> tuple[CheckedPoints, dict[str, Any]]:
-        """Return points that a person checked or the base is sure of, and their counts."""
-        arrays, codes = points.arrays, points.codes_of(self.label)
-        checked = sure = np.zeros(points.count, np.bool_)
-        if CHECKED in arrays:
-            checked = np.asarray(arrays[CHECKED]) > 0
-        if self.base and "Reliability" in arrays:
-            sure = np.asarray(arrays["Reliability"]) >= SURE
-        part = CheckedPoints(checked & points.inside, sure & points.inside & ~checked, codes)
-        return part, part.counts(int(np.count_nonzero(checked)))
-
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
         """Return which points (n,) samples are drawn from; None for all."""
         if CHECKED not in points.arrays or not self.checked_only:
             return points.mask
-        part, counts = self.checked_points(points)
-        choice = self.choice([counts])
-        if not choice:
-            return points.mask
-        choice.report_to(points.report)
-        return choice.mask(part, points.xyz)
+        known = [] if self.base is None else loaded_model(self.base).codes.tolist()
+        chosen = select_checked(points, points.codes_of(self.label), known, self.seed)
+        return points.mask if chosen is None else chosen
