@@ -197,7 +197,7 @@ def test_layers_are_written_all_or_none_and_nothing_older_is_left(
     ]
     stage = Pipeline(job).expanded.ours[0].stage
     assert [output.path for output in stage.outputs()] == [str(tmp_path / name) for name in names]
-    old.write_text("of an earlier run")
+    old.write_text('{"of": "an earlier run"}')
     Pipeline(job).execute(arrays=False)
     assert not capsys.readouterr().err
     assert {path.name for path in tmp_path.glob(f"*.{ending}")} == set(names)

@@ -13,7 +13,8 @@ import pytest
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.units import Units, horizontal_part, units_of_wkt
+from pdal_stages.base.units import Units, units_of_wkt
+from pdal_stages.base.vector import horizontal_wkt
 from pdal_stages.cli import main
 from pdal_stages.pipeline.expansion import check_dimensions
 from pdal_stages.pipeline.spatial_reference import fault_of_reference, reference_of_file
@@ -178,20 +179,6 @@ def test_objects_of_files_without_a_reference_beside_others(tmp_path, inputs, ca
     assert f"{files[1]} has no spatial reference; it is assumed to have" in capsys.readouterr().err
 
 
-def test_geotiff_keys_of_las_14_in_old_point_formats(tmp_path, write_las):
-    path, xyz = tmp_path / "in.las", np.random.default_rng(0).uniform(0, 30, (3, 100))
-    for key, value, horizontal in (
-        (3072, 2264, 1200 / 3937),
-        (3072, 32767, 1.0),
-        (4096, 5703, 1.0),
-    ):
-        las = laspy.read(write_las(path, dict(zip("XYZ", xyz, strict=True)), 1, 4))
-        data = struct.pack("<8H", 1, 1, 0, 1, key, 0, 1, value)
-        las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", data))
-        las.write(path)
-        assert reference_of_file(str(path)).units.horizontal == pytest.approx(horizontal)
-
-
 # ---- units of x and y, and of z, the same for every command -------------------------------------------------
 
 FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
@@ -250,8 +237,8 @@ def test_commands_and_stages_take_the_same_units(
     )
     ps.run_pipeline([str(path), {"type": "filters.hag_minima"}])
     assert seen == [reference_values.units]
-    part = horizontal_part(reference_values.wkt)
-    assert part.startswith("PROJCS[") and part.endswith("]") and "VERT" not in part
+    part = horizontal_wkt(reference_values.wkt)
+    assert part.startswith("PROJCRS[") and "VERT" not in part
     assert units_of_wkt(part).horizontal == pytest.approx(units[0])
     assert reference_of_file(str(path), "ft", "m").units == Units(FOOT, 1.0)
 

@@ -11,7 +11,6 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.units import (
     Units,
     doubt_vertical_unit,
-    horizontal_part,
     parse_wkt,
     units_of_wkt,
 )
@@ -55,13 +54,6 @@ def test_vegetation_too_high_to_be_true_doubts_the_unit_of_z():
     assert "override_srs" in doubt_vertical_unit(feet, 1.0)
     for fine in (np.linspace(0, 95, 5000), feet[:900], np.append(np.zeros(5000), [500.0] * 40)):
         assert not doubt_vertical_unit(fine, 1.0)
-
-
-def test_the_horizontal_part_of_a_reference():
-    assert horizontal_part(BOTH) == METERS
-    assert horizontal_part(f'COMPOUNDCRS["a ""[x]"" b",{WKT2},VERTCRS["v"]]') == WKT2
-    for whole in (METERS, WKT2, "", 'COMPD_CS["cut",PROJCS["x"'):
-        assert horizontal_part(whole) == whole
 
 
 @pytest.mark.parametrize(

@@ -220,23 +220,6 @@ def projection_digest(path: str | os.PathLike) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()[:16] if parts else ""
 
 
-def geotiff_code(path: str | os.PathLike) -> str:
-    """Return EPSG's code in the GeoTIFF keys of LAS 1.4 in point formats 0 to 5, or an empty text.
-
-    Such as ``EPSG:2154+5720``; PDAL 2.2 does not read these keys.
-    """
-    header = read_header(path)
-    if header is None or header.minor < 4 or header.point_format > 5:
-        return ""
-    held = {record.number: data for record, data in records_of(path, b"LASF_Projection")}
-    data = b"" if 2112 in held else held.get(34735, b"")
-    entries = struct.iter_unpack("<4H", data[: len(data) // 8 * 8])
-    keys = {key: code for key, place, _, code in entries if not place}
-    across, upward = keys.get(3072) or keys.get(2048, 0), keys.get(4096, 0)
-    height = f"+{upward}" * (0 < upward < 32767)  # which stands for a user's own
-    return f"EPSG:{across}{height}" if 0 < across < 32767 else ""
-
-
 # Numbers of GeoTIFF keys.
 _MODEL_TYPE = 1024  #: type of the model, 1 for projected
 _ANGULAR_UNIT = 2054

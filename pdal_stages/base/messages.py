@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,11 +50,6 @@ class PlainStream:
         """Write the escaped text; return the number of characters before escaping."""
         self.stream.write(plain(text))
         return len(text)
-
-    def writelines(self, lines: Iterable[str]) -> None:
-        """Write lines one by one."""
-        for line in lines:
-            self.write(line)
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the stream underneath."""

@@ -247,19 +247,6 @@ def parse_wkt(text: str) -> WktNode | None:
     return stack[0].children[0] if stack[0].children else None
 
 
-def horizontal_part(wkt: str) -> str:
-    """Return the horizontal system of a compound one in well-known text; others unchanged."""
-    compound = re.match(
-        r'\s*(?:COMPD_CS|COMPOUNDCRS)\s*[\[(]\s*"(?:[^"]|"")*"\s*,\s*', wkt, re.IGNORECASE
-    )
-    depth = 0
-    for match in _TOKEN.finditer(wkt, compound.end()) if compound else ():
-        depth += bool(match[3]) - bool(match[4])
-        if compound and match[4] and not depth:
-            return wkt[compound.end() : match.end()]
-    return wkt
-
-
 def name_of_wkt(wkt: str) -> str:
     """Return the name of a spatial reference in well-known text, with its authority's code."""
     root = parse_wkt(wkt)

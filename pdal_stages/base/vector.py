@@ -200,6 +200,11 @@ def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
     return lambda x, y: forward.transform(x, y), padded
 
 
+def horizontal_wkt(wkt: str) -> str:
+    """Return the horizontal part of a reference system, as well-known text."""
+    return _horizontal(vector("pyproj").CRS.from_user_input(wkt)).to_wkt() if wkt else ""
+
+
 def _horizontal(crs: Any) -> Any:
     """Return the horizontal part of a reference system."""
     if crs.is_compound:

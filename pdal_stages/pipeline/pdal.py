@@ -25,7 +25,7 @@ from types import CodeType, FrameType
 from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
-from ..base.las import geotiff_code, header_there, named_copc, named_las, source_id
+from ..base.las import header_there, named_copc, named_las, source_id
 from ..base.las_check import CURE_OF_DAMAGE, check_readable
 from ..base.las_repair import LARGEST_HEAD, corrected
 from .inputs_outputs import readers_files, writers_outputs
@@ -412,10 +412,6 @@ def for_this_version(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
             stage = {"measure_dim": "Z", **stage}
         elif kind == "readers.copc":
             stage = {**stage, "type": "readers.las"}  # which refuses options to read a part
-        else:
-            codes = {geotiff_code(path) for path in readers_files([stage], las=True)}
-            if len(codes) == 1 and "" not in codes:  # which that PDAL does not look at
-                stage = {"default_srs": codes.pop(), **stage}
         out.append(stage)
     return out
 

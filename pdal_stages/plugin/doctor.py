@@ -12,7 +12,6 @@ from importlib import metadata
 from pathlib import Path
 
 from ..base.errors import PipelineError, StageError, how_to_add
-from ..base.jit import count_cached_kernels
 from ..base.memory import free_memory
 from ..base.threads import available_threads
 from ..base.version import __version__
@@ -135,14 +134,10 @@ def _plugin() -> Iterator[Finding]:
 
 
 def _machine() -> Iterator[Finding]:
-    yield Finding("cores", str(available_threads()))
     free = free_memory()
     cure = "" if free >= _LITTLE_MEMORY else "Work in tiles (--tile), or close other programs"
-    yield Finding("free memory", f"{free / 2**30:.1f} GB", cure, needed=False)
-    count = count_cached_kernels()
-    cure = "pdal-stages warmup, once; otherwise the first job waits for the compiler"
-    cure = "" if count else cure
-    yield Finding("compiled kernels", f"{count or 'none yet'}", cure, needed=False)
+    found = f"{available_threads()} cores, {free / 2**30:.1f} GB of free memory"
+    yield Finding("machine", found, cure, needed=False)
 
 
 def _extras() -> Iterator[Finding]:

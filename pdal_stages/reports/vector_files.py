@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import check_writable, whole_files
-from ..base.units import horizontal_part
-from ..base.vector import refuse_odd_name, vector
+from ..base.vector import horizontal_wkt, refuse_odd_name, vector
 
 #: GDAL's drivers by the ending of a file's name.
 DRIVERS = {
@@ -106,7 +105,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
                 list(layer.columns),
                 driver=driver,
                 geometry_type=layer.kind,
-                crs=horizontal_part(wkt) or None,
+                crs=horizontal_wkt(wkt) or None,
                 layer=layer_name,
                 **({"VERSION": "1.2"} if layer_name else {}),  # GDAL before 3.7 warns of others
             )
