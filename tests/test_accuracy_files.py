@@ -12,26 +12,11 @@ from test_training_scores import scene
 from pdal_stages.base.errors import StageError
 from pdal_stages.cli import main
 from pdal_stages.pipeline.accuracy_files import _refuse_other_points, paired
-from pdal_stages.reports.accuracy_page import Place, places
 from pdal_stages.stages.points import Points
 
 
-def place(name, x, n=50):
-    xyz = np.random.default_rng(0).random((n, 3)) * 10 + [x, 0, 0]
-    return Place(name, xyz, np.full(n, 2), np.full(n, 2))
-
-
-def test_files_near_one_another_share_a_map():
-    files = [place("a", 0), place("b", 600_000), place("c", 900), place("d", 1800)]
-    matches = places(files)
-    assert [match.name for match in matches] == ["a, c, d", "b"]
-    assert [len(match.xyz) for match in matches] == [150, 50]
-    # Of another reference system, they lie elsewhere.
-    assert [match.name for match in places(files, ["x", "x", "y", "y"])] == ["a", "b", "c, d"]
-
-
 @pytest.mark.pdal
-def test_each_file_has_its_line_and_each_place_its_map(tmp_path, write_las, capfd):
+def test_each_file_has_its_line_and_its_map(tmp_path, write_las, capfd):
     for name, x0, wrong in (("a", 0.0, 0.1), ("b", 60.0, 0.4), ("far", 300_000.0, 0.0)):
         points = scene(1, x0)
         points["Reference"] = points["Classification"].copy()
@@ -55,7 +40,7 @@ def test_each_file_has_its_line_and_each_place_its_map(tmp_path, write_las, capf
     right = sum(entry["points"] * entry["overall_accuracy"] for entry in report["files"])
     assert np.isclose(report["overall_accuracy"], right / report["points"])
     text = page.read_text()
-    assert text.count("<h2>Maps") == 2 and "Maps: far.laz" in text
+    assert text.count("<h2>Maps") == 3 and "Maps: far.laz" in text
 
 
 @pytest.mark.parametrize(("moved", "refused"), [(0.005, False), (0.02, True)])

@@ -64,14 +64,6 @@ def test_points_left_over_take_the_nearest():
     assert match_points(before, after, 0.001).tolist() == [1, -1, -1, -1]
 
 
-def test_near_any_is_what_distances_say():
-    random = np.random.default_rng(3)
-    xyz, chosen = random.random((300, 3)) * 10, random.random(300) < 0.02
-    far = np.linalg.norm(xyz[:, None] - xyz[chosen][None], axis=2).min(axis=1)
-    assert np.array_equal(is_near(xyz, chosen, 1.5), far <= 1.5)
-    assert np.array_equal(is_near(xyz, chosen, 0.0), chosen)
-
-
 @pytest.mark.parametrize("how", [{}, {"drop": 30}, {"scale": 0.01}])
 def test_changes_are_found_in_any_order(town, tmp_path, how, run):
     corner, _ = changed_copy(town, tmp_path / "after.laz", **how)

@@ -233,7 +233,7 @@ def profile(zipped, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def environment_of(profile, program):
+def clean_machine(profile, program):
     """QGIS's environment: a clean machine's, which knows where the program is."""
     runtime = profile / "runtime"
     runtime.mkdir(mode=0o700, exist_ok=True)
@@ -244,11 +244,11 @@ def environment_of(profile, program):
 
 
 @pytest.fixture(scope="module")
-def qgis(around):
+def qgis(clean_machine):
     """Run qgis_process; what it printed."""
 
     def run(*words, code=0, **more):
-        done = ended(PROCESS, *words, env={**around, **more})
+        done = ended(PROCESS, *words, env={**clean_machine, **more})
         output = done.stdout + done.stderr
         assert (done.returncode == 0) == (code == 0), output
         return output
@@ -258,13 +258,13 @@ def qgis(around):
 
 
 @pytest.fixture(scope="module")
-def session(around, profile):
+def session(clean_machine, profile):
     """Run tests/qgis_session.py in QGIS's own Python."""
 
     def run(*words, **more):
         plugins = profile / "profiles/default/python/plugins"
         command = "/usr/bin/python3", ROOT / "tests" / "qgis_session.py", plugins
-        return json.loads(printed(*command, *words, env={**around, **more}).splitlines()[-1])
+        return json.loads(printed(*command, *words, env={**clean_machine, **more}).splitlines()[-1])
 
     return run
 
@@ -349,8 +349,8 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     layers = {"terrain": "hillshade", "heights": "singlebandpseudocolor", "classes": "paletted"}
     assert shown["building"] == [214, 78, 60] and shown["layers"] | layers == shown["layers"]
     assert shown["layers"]["buildings"] == "RuleRenderer"
-    output = algorithm("review", INPUTS=cloud, OUTPUT=out / "r.gpkg", PAGE=out / "r.html")
-    assert (out / "r.gpkg").is_file() and (out / "r.html").is_file(), output
+    output = algorithm("review", INPUTS=cloud, OUTPUT=out / "r.gpkg")
+    assert (out / "r.gpkg").is_file(), output
     marked = {"BEFORE": cloud, "AFTER": ready_town, "OUTPUT": out / "k.laz", "AROUND": 2}
     output = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
     assert "no patch is marked as checked" in output and not (out / "k.laz").exists()

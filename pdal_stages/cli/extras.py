@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 
 from .parser import Parser, add_stage_options, stage_options
 
@@ -28,7 +27,6 @@ def add_commands(parser: Parser) -> None:
     add = parser.command("review", _review, what, progress=True)
     add("inputs", nargs="+", metavar="input", help=_INPUTS)
     add("output", help=_VECTOR_FILE)
-    add("--html", metavar="FILE", help="Web page to write (default: beside the vector file)")
     add("--json", metavar="FILE", help="Write figures to a JSON file")
     add("--share", type=float, default=0.95, help="Share of expected errors to cover (0.95)")
     cell = "Side of the cells (default: by density)"
@@ -68,11 +66,10 @@ def _review(options: argparse.Namespace) -> None:
     """List the places to check."""
     from ..review.review_files import lines, write_review
 
-    html = re.sub(r"\.\w+$", ".html", options.output) if options.html is None else options.html
     settings = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
-    review = write_review(options.inputs, options.output, html, options.json or "", **settings)
+    review = write_review(options.inputs, options.output, options.json or "", **settings)
     print("\n".join(lines(review.to_dict())))
-    print(f"written to {', '.join(name for name in (options.output, html, options.json) if name)}")
+    print(f"written to {', '.join(name for name in (options.output, options.json) if name)}")
 
 
 def _corrections(options: argparse.Namespace) -> None:

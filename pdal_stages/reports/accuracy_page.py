@@ -11,20 +11,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse.csgraph import connected_components
 
-from ..accuracy.labels import as_codes, refuse_other_lengths
 from ..accuracy.measures import Accuracy
 from ..base.asprs import class_color
-from ..base.errors import StageError
 from ..base.files import write_whole
 from .page import render
 from .pictures import IGNORED, RIGHT, WRONG, embed, error_colors, nice_step, paint, shading, surface
 
 # Values without a reason are not tuned.
-#: Files within this distance share a map, meters: tiles of a survey that has gaps.
-MAX_GAP = 1000.0
-#: Places that get maps; three maps of each are in the page, which a browser must still open.
+#: Files that get maps; three maps of each are in the page, which a browser must still open.
 MAX_PLACES = 12
 #: Width of a map, pixels.
 MAX_WIDTH = 820
@@ -42,35 +37,12 @@ MAX_IN_A_ROW = 1.7
 
 @dataclass(frozen=True)
 class Place:
-    """Points of a file, or of several nearby ones, with both classifications before any merge."""
+    """Points of a file with both classifications before any merge."""
 
     name: str
     xyz: npt.NDArray[np.float64]  #: (n, 3) meters
     reference: npt.NDArray[Any]  #: (n,) class codes
     predicted: npt.NDArray[Any]  #: (n,) class codes
-
-
-def places(files: Sequence[Place], systems: Sequence[str] = ()) -> list[Place]:
-    """Join files within :data:`MAX_GAP` of each other, in the same reference system."""
-    filled = [k for k, file in enumerate(files) if len(file.xyz)]
-    if not filled:
-        return []
-    low, high = (
-        np.array([end(files[k].xyz[:, :2], axis=0) for k in filled]) for end in (np.min, np.max)
-    )
-    gaps = (low[:, None] - high[None]).clip(0) + (low[None] - high[:, None]).clip(0)
-    system = np.array([systems[k] if systems else "" for k in filled])
-    near = np.linalg.norm(gaps, axis=2) <= MAX_GAP
-    _, group = connected_components(near & (system[:, None] == system))
-    out = []
-    for number in dict.fromkeys(group.tolist()):
-        members = [files[filled[k]] for k in np.flatnonzero(group == number)]
-        name = ", ".join(member.name for member in members[:3])
-        name += f" and {len(members) - 3:,} more" * (len(members) > 3)
-        sides = ("xyz", "reference", "predicted")
-        arrays = (np.concatenate([getattr(each, side) for each in members]) for side in sides)
-        out.append(Place(name, *arrays))
-    return out
 
 
 def write_accuracy_report(
@@ -103,7 +75,7 @@ def write_accuracy_report(
     Raises
     ------
     StageError
-        Arrays of different lengths, coordinates that are not finite, a file that cannot be written.
+        Arrays of different lengths, or a file that cannot be written.
     """
     names = [place.name if len(places) > 1 else "" for place in places[:MAX_PLACES]]
     maps = [_maps(accuracy, place) for place in places[:MAX_PLACES]]
@@ -127,10 +99,7 @@ def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
     There are none where the points lie at one place or in a line.
     """
     points = np.asarray(place.xyz, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise StageError("'xyz' must be n x 3 finite coordinates", found=f"shape {points.shape}")
-    true, labels = as_codes(place.reference, "reference"), as_codes(place.predicted, "prediction")
-    refuse_other_lengths(true, {"prediction": labels, "list of coordinates": points})
+    true, labels = place.reference, place.predicted
     target_of = np.arange(1 << 16)
     target_of[list(a.merged)] = list(a.merged.values())
     compared = np.isin(target_of[true], a.classes) & ~np.isin(true, list(a.left_out))

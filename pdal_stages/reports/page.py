@@ -93,7 +93,6 @@ def _today() -> str:
 
 def run_page(run: Mapping[str, Any]) -> str:
     """Return the page about a run, in tiles or in one piece: ``TiledRun.to_dict``."""
-    done = sorted((t for t in run["tiles"] if t["state"] == "done"), key=lambda t: -t["seconds"])
     classes = run.get("classes") or {}
     tiles = "in one piece"
     if "tile" in run:
@@ -107,11 +106,7 @@ def run_page(run: Mapping[str, Any]) -> str:
         figures=_figures(run),
         what=_settings(run),
         classes=[(int(code), class_name(int(code)), count) for code, count in classes.items()],
-        slowest=[
-            (t, ", ".join(f"{k * run['tile']:.10g}" for k in t["tile"])) for t in done[:TABLE_ROWS]
-        ],
         most=TABLE_ROWS,
-        done=len(done),
     )
 
 

@@ -1,11 +1,10 @@
 """Review: read classified files, find the patches that a person should check, and write them.
 
-A review becomes vector layers with styles for QGIS, a web page, JSON and lines of text.
+A review becomes vector layers with styles for QGIS, JSON and lines of text.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,9 +17,9 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.asprs import NOISE
 from ..base.errors import StageError
-from ..base.files import HTML, JSON, Output, check_outputs, whole_files
+from ..base.files import JSON, Output, check_outputs, write_json
 from ..base.las import read_header
-from ..base.messages import count_of, duration, one_line, print_messages
+from ..base.messages import one_line, print_messages
 from ..base.vector import vector
 from ..base.version import __version__
 from ..classifier.model import loaded_model
@@ -29,7 +28,6 @@ from ..pipeline.inputs_outputs import input_files
 from ..pipeline.las_files import can_read_chunks, read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..pipeline.workers import each_file
-from ..reports.page import TABLE_ROWS, render
 from ..reports.vector_files import Layer, check_target, qml, write_layers
 from ..stages.points import Points
 from .expected_errors import Patches, ReviewCells, cell_side, find_patches
@@ -42,8 +40,6 @@ JSON_ROWS = 1000
 LAYERS = ("patches", "tiles")
 #: Rows in the text: few enough for a terminal.
 TEXT_ROWS = 10
-#: Shares of the expected errors for which the page has the time that finds them.
-TIMED_SHARES = (0.25, 0.5, 0.75, 0.9)
 #: Quantiles of patches' expected errors at which the colors change; not tuned.
 COLOR_QUANTILES = (0.5, 0.8, 0.95)
 #: Fill colors (red, green, blue, opacity) of patches, from fewest to most expected errors.
@@ -238,29 +234,20 @@ def compute_reliability(points: Mapping[str, NDArray], model_name: str) -> NDArr
     return np.where(column >= 0, probability, 1.0).astype(np.float32)
 
 
-def write_review(
-    inputs: Sequence[str], output: str, html: str = "", json_file: str = "", **options: Any
-) -> Review:
-    """Review files, and write a vector file and, where named, a page and a JSON file.
+def write_review(inputs: Sequence[str], output: str, json_file: str = "", **options: Any) -> Review:
+    """Review files, and write a vector file and, where named, a JSON file.
 
     `options` are those of :func:`review_files`.
     """
     check_target(output, LAYERS)
-    pages = {"html": (html, HTML), "json": (json_file, JSON)}
-    outputs = [Output(path, what, kind) for what, (path, kind) in pages.items() if path]
-    check_outputs(
-        [Output(output, "review"), *outputs],
-        [*input_files(inputs), *inputs, find(options.get("model", STANDARD))],
-    )
+    outputs = [Output(output, "review")] + [Output(json_file, "json", JSON)] * bool(json_file)
+    check_outputs(outputs, [*input_files(inputs), *inputs, find(options.get("model", STANDARD))])
     review = review_files(inputs, **options)
     layers = review_layers(review)
-    with whole_files(*filter(None, (json_file, html))) as files:
-        if json_file:
-            files[0].write_bytes((json.dumps(review.to_dict(), indent=1) + "\n").encode())
-        if html:
-            files[-1].write_bytes(review_page(review).encode())
-        wkt = reference_of_file(review.files[0]).wkt
-        write_layers(output, layers, wkt, styles(review.patches.errors))
+    wkt = reference_of_file(review.files[0]).wkt
+    write_layers(output, layers, wkt, styles(review.patches.errors))
+    if json_file:
+        write_json(json_file, review.to_dict(), "json")
     return review
 
 
@@ -287,33 +274,6 @@ def _columns(rows: Sequence[dict[str, Any]]) -> dict[str, NDArray]:
     names = [name for name in (rows[0] if rows else {}) if name not in ("at", "file")]
     types = {name: object if isinstance(rows[0][name], str) else None for name in names}
     return {name: np.array([row[name] for row in rows], types[name]) for name in names}
-
-
-def review_page(review: Review) -> str:
-    """Return a page: counts, time that finds shares of the expected errors, tiles, patches."""
-    result = review.to_dict()
-    points, expected = result["points"], result["expected"]
-    percent = f"{100 * expected / max(points, 1):.2f} % of them"
-    figures = [
-        ("Points judged", f"{points:,}", "", "ground, vegetation and buildings"),
-        ("Expected wrong", f"{expected:,.0f}", "", percent),
-        ("Patches", f"{result['listed']:,}", "", "in the vector file, worst first"),
-    ]
-    errors, minutes = np.cumsum(review.patches.errors), np.cumsum(review.patches.minutes)
-    for share in TIMED_SHARES if expected > 0 else ():
-        place = min(int(np.searchsorted(errors, share * errors[-1])), len(minutes) - 1)
-        time = duration(60 * minutes[place])
-        figures.append((f"{100 * share:.0f} % of these", time, "", "of looking"))
-    return render(
-        "review.html",
-        title="Where to look",
-        subtitle=count_of(len(result["tiles"]), "file"),
-        figures=figures,
-        tiles=result["tiles"][:TABLE_ROWS],
-        hidden=max(0, len(result["tiles"]) - TABLE_ROWS),
-        patches=result["worst"][:TABLE_ROWS],
-        listed=result["listed"],
-    )
 
 
 def lines(result: Mapping[str, Any]) -> list[str]:

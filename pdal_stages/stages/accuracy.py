@@ -219,7 +219,7 @@ class AccuracyStage(Stage):
         accuracy: Accuracy,
         rule: Mapping[str, Any],
     ) -> None:
-        from ..reports.accuracy_page import Place, places, write_accuracy_report
+        from ..reports.accuracy_page import Place, write_accuracy_report
 
         wkts = [points.wkt for _, points in parts]
         systems = ", ".join(dict.fromkeys(name_of_wkt(wkt) or "none given" for wkt in wkts))
@@ -234,11 +234,12 @@ class AccuracyStage(Stage):
         shown = [
             Place(name, points.xyz[side.inside], side.reference, side.predicted)
             for (name, points), side in zip(parts, sides, strict=True)
+            if side.inside.any()
         ]
         write_accuracy_report(
             path,
             accuracy,
-            places=places(shown, wkts),
+            places=shown,
             subtitle="; ".join(map(str, filter(None, [*self.files[:3], systems, self.model_file]))),
             importances=importances,
             settings=settings,

@@ -346,7 +346,7 @@ class Accuracy(Algorithm):
         "under Processing > Results Viewer."
     )
     listed = ("dimension", "reference_dimension")
-    handled = ("reference", "json", "html", "objects", "area")
+    handled = ("reference", "json", "html")
 
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Classified point cloud")
@@ -435,30 +435,25 @@ class Review(_Showing):
     )
     about = (
         "Lists where a person should look in classified point clouds, worst first, as patches with "
-        "the number of errors expected in each, and as a page. What is right or was corrected can "
-        "be learned from: see Corrections."
+        "the number of errors expected in each. What is right or was corrected can be learned "
+        "from: see Corrections."
     )
     listed = ("share",)
-    handled = ("html", "json")
+    handled = ("json",)
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
         self.add_declared()
         self.add_destination("OUTPUT", "Patches", self.help_of("output"), _VECTORS)
-        self.add_destination(
-            "PAGE", "Page", "The worst patches; under Processing > Results Viewer", _PAGES
-        )
-        self.addOutput(QgsProcessingOutputHtml("HTML", "Page"))
         self.add_show()
 
     def processAlgorithm(self, parameters, context, feedback):
         target = self.destination(parameters, "OUTPUT", context)
-        page = self.destination(parameters, "PAGE", context)
-        chosen = [*self.arguments(parameters, context), f"--html={page}"]
+        chosen = self.arguments(parameters, context)
         self.execute(["review", *chosen, *self.inputs(parameters, context), target], feedback)
         if self.parameterAsBool(parameters, "SHOW", context):
             self.to_show.append(("vector", target))
-        return {"OUTPUT": target, "PAGE": page, "HTML": page}
+        return {"OUTPUT": target}
 
 
 class Corrections(_Showing):
