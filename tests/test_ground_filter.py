@@ -356,16 +356,17 @@ def test_sizes_and_shapes_are_checked():
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("name", ["samp12", "samp31"])
-def test_ground_of_real_clouds(data_dir, name):
+@pytest.mark.parametrize(
+    ("name", "most"), [("samp12", 0.025), ("samp24", 0.04), ("samp31", 0.015), ("samp53", 0.05)]
+)
+def test_ground_of_real_clouds(data_dir, name, most):
     import laspy
 
     las = laspy.read(data_dir / "isprs_filter" / f"{name}.laz")
     true = np.asarray(las.classification) == 2
     result = filtered_ground(las.x, las.y, las.z)
-    wrong = (result["Ground"] == 1) != true
-    assert wrong.mean() < 0.04
-    assert np.abs(result["HeightAboveGround"][true]).mean() < 0.1
+    assert ((result["Ground"] == 1) != true).mean() < most
+    assert np.median(np.abs(result["HeightAboveGround"][true])) < 0.1
 
 
 # ---- the stage -------------------------------------------------------------------------------------------
