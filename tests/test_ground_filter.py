@@ -158,16 +158,15 @@ def test_planes_equal_the_slow_reference(slope):
     raster = np.where(rng.random((h, w)) < 0.5, floor, np.float32(np.inf))
     raster[ground] = floor[ground]
     every = np.ones((h, w), bool)
-    planes = planes_of_blocks(GroundRaster(window, raster, place, ground, floor, {}), 3, every)
+    blocks = GroundRaster(window, raster, place, ground, floor, {})
+    planes, (first, lowest) = planes_of_blocks(blocks, 3, every)
     places = [(j, i, (i + left, j + bottom)) for j in range(h) for i in range(w)]
     cells = {c: (place[j, i, :2], place[j, i, 2]) for j, i, c in places if ground[j, i]}
     known = {c: floor[j, i] for j, i, c in places if np.isfinite(raster[j, i])}
     for k in rng.choice(len(places), 4, replace=False):
         column, row = np.array(places[k][2]) // 2
         want = slow_planes(cells, 1, known, (column, row))
-        assert planes.values[row - planes.bottom, column - planes.left] == pytest.approx(
-            want, abs=1e-6
-        )
+        assert planes[row - lowest, column - first] == pytest.approx(want, abs=1e-6)
 
 
 # ---- land that was dug: real clouds, and what must stay ground ----------------------------------------------

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError, StageError
-from pdal_stages.terrain.minima import MinimaTerrain, hag_minima
+from pdal_stages.terrain.minima import hag_minima
 
 
 def slow_hag(x, y, z, cell, resolution):
@@ -59,20 +59,19 @@ def test_one_stray_point_costs_one_cell():
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 100, (2, 1000))
     z = rng.normal(0, 1, 1000)
-    terrain = MinimaTerrain(np.append(x, 1e9), np.append(y, -1e9), np.append(z, 7.0))
-    assert terrain.figures["cells"] == 26
-    both = hag_minima(np.append(x, 1e9), np.append(y, -1e9), np.append(z, 7.0))
+    figures = {}
+    both = hag_minima(np.append(x, 1e9), np.append(y, -1e9), np.append(z, 7.0), figures=figures)
+    assert figures["cells"] == 26
     assert np.array_equal(both[:-1], hag_minima(x, y, z))
     assert both[-1] == 0.0
 
 
 def test_gaps_are_filled_and_counted():
-    x = np.array([1.0, 201.0, 100.0])
-    terrain = MinimaTerrain(x, np.zeros(3), np.array([0.0, 10.0, 50.0]))
-    ground = terrain.at(np.array([55.0]), np.array([0.0]))
-    assert 0.0 < ground[0] < 50.0
-    assert terrain.figures["interpolated_cells"] > 0
-    assert terrain.figures["farthest_fill"] >= 20.0
+    x, z, figures = [1.0, 201.0, 100.0, 55.0], [0.0, 10.0, 50.0, 0.0], {}
+    forms = [True, True, True, False]
+    height = hag_minima(x, np.zeros(4), z, mask=forms, figures=figures)
+    assert -50.0 < height[3] < 0.0
+    assert figures["interpolated_cells"] > 0 and figures["farthest_fill"] >= 20.0
 
 
 def test_not_finite_coordinates_stay_apart():

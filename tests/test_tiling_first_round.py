@@ -10,7 +10,6 @@ from test_ground_filter import town
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.terrain import filtered_ground
-from pdal_stages.terrain.cells import lowest_of_cells
 from pdal_stages.terrain.ground_blocks import (
     BLOCK_SIDE,
     GroundCells,
@@ -34,14 +33,14 @@ def test_the_lowest_points_of_cells(cell):
     x[:5] += 1e7  # strays
     z[7] = -1e7
     use = rng.random(3000) < 0.9
-    lowest = lowest_of_cells(x, y, z, use, cell)
+    lowest = around_blocks(x, y, z, use, FilterOptions(cell=cell))
     best: dict[tuple[int, int], tuple] = {}
     for n in np.flatnonzero(use & (np.abs(z) < 1e6)):
         key = (int(np.floor(x[n] / cell)), int(np.floor(y[n] / cell)))
         best[key] = min(best.get(key, (np.inf,)), (z[n], x[n], y[n]))
-    assert {(z[n], x[n], y[n]) for n in lowest} == set(best.values())
+    assert {(z, x, y) for x, y, z in lowest} == set(best.values())
     assert len(lowest) == len(best)
-    assert lowest_of_cells(x, y, z, np.zeros(3000, bool), cell).size == 0
+    assert around_blocks(x, y, z, np.zeros(3000, bool), FilterOptions(cell=cell)).size == 0
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..terrain.minima import MinimaTerrain, check_sizes, terrain_reach
+from ..terrain.minima import check_sizes, hag_minima, terrain_reach
 from .base import HEIGHTS_OUTSIDE, Stage, StageContext
 from .options import Selection, ignore_option, option
 from .points import Points
@@ -66,9 +66,15 @@ class HagMinima(Stage):
         forms = points.usable(self.ignore)
         if points.mask is not None and not points.mask.any():  # which the report says
             return {}
-        terrain = MinimaTerrain(x, y, z, cell=self.cell, resolution=self.resolution, mask=forms)
         wanted = points.wanting("HeightAboveGround", context.created_before)
+        found = hag_minima(
+            *(x, y, z),
+            cell=self.cell,
+            resolution=self.resolution,
+            mask=forms,
+            wanted=wanted,
+            figures=points.report.figures,
+        )
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
-        height[wanted] = (z[wanted] - terrain.at(x[wanted], y[wanted])) / points.units.vertical
-        points.report.figures |= terrain.figures
+        height[wanted] = found[wanted] / points.units.vertical
         return {"HeightAboveGround": height}

@@ -4,7 +4,7 @@ The published minima grid [W18] and filtered ground [P13].
 """
 
 from .heights import filtered_ground
-from .minima import MinimaTerrain, hag_minima
+from .minima import hag_minima
 from .noise import detached_noise
 
-__all__ = ["MinimaTerrain", "detached_noise", "filtered_ground", "hag_minima"]
+__all__ = ["detached_noise", "filtered_ground", "hag_minima"]

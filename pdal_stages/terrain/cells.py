@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import StageError
-from ..base.grid import begins_run, cell_keys, cell_numbers
+from ..base.grid import begins_run
 
 #: What a raster has where nothing was measured.
 HOLE = np.float32(np.inf)
@@ -16,38 +18,17 @@ HIGHEST = 1e6
 LAYER_GAP_M = 1.0
 
 
-def sums_around(values: NDArray, reach: int) -> NDArray[np.int64]:
-    """Sum whole numbers over the square that goes `reach` cells to every side of each cell.
-
-    Values have the shape (h, w, ...).
-    """
-    sums = np.asarray(values)
-    for axis in (0, 1):
-        total = np.moveaxis(np.cumsum(sums, axis, np.int64), axis, 0)
-        sums = np.empty(sums.shape, np.int64)
-        lines, ahead = np.moveaxis(sums, axis, 0), max(len(total) - reach, 0)
-        lines[:ahead], lines[ahead:] = total[reach:], total[-1:]
-        lines[reach + 1 :] -= total[: max(ahead - 1, 0)]
-    return sums
-
-
 def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDArray[np.float64]]:
     """Return three arrays of one length, from three or from one of shape (n, 3).
 
     StageError where shapes differ.
     """
-    if y is None and z is None:
-        xyz = np.asarray(x, np.float64)
-        if xyz.ndim != 2 or xyz.shape[1] != 3:
-            raise StageError(
-                "points must be an array of shape (n, 3), or x, y and z", found=xyz.shape
-            )
-        return [np.ascontiguousarray(column) for column in xyz.T]
-    axes = [np.ascontiguousarray(np.asarray(a, np.float64)) for a in (x, y, z)]
-    if not (axes[0].shape == axes[1].shape == axes[2].shape and axes[0].ndim == 1):
+    given: Any = np.asarray(x).T if y is None and z is None else (x, y, z)
+    axes = [np.asarray(axis, np.float64, order="C") for axis in given]
+    if len(axes) != 3 or axes[0].ndim != 1 or len({axis.shape for axis in axes}) > 1:
         raise StageError(
-            "x, y and z must be one-dimensional and of one length",
-            found=tuple(a.shape for a in axes),
+            "points must be an array of shape (n, 3), or x, y and z of one length",
+            found=f"{len(axes)} columns of shape {', '.join(str(a.shape) for a in axes[:3])}",
         )
     return axes
 
@@ -89,24 +70,6 @@ def lowest_points(
     tied = tied[np.lexsort((y[tied], x[tied]))[::-1]]
     first[cell[tied]] = tied  # the last of a cell stands
     return first
-
-
-def lowest_of_cells(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    use: NDArray[np.bool_],
-    cell: float,
-) -> NDArray[np.int64]:
-    """Return the indices of the points that are the lowest usable ones of their cells.
-
-    Coordinates are finite, in meters.
-    """
-    usable_ones = np.flatnonzero(use & (np.abs(z) < HIGHEST))
-    x, y, z = x[usable_ones], y[usable_ones], z[usable_ones]
-    key = cell_keys(cell_numbers(x, cell), cell_numbers(y, cell))
-    cells, number = np.unique(key, return_inverse=True)
-    return usable_ones[lowest_points(x, y, z, number, len(cells))]
 
 
 def levels(

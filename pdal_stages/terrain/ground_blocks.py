@@ -5,7 +5,7 @@ They are computed once, from the lowest points far around and all points inside.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.grid import GridWindow, cell_keys, cell_numbers, group_by_key
-from .cells import HIGHEST, HOLE, lowest_of_cells
+from .cells import HIGHEST, HOLE, lowest_points
 from .openings import FILL_RINGS
 from .smrf import (
     RIM,
@@ -21,9 +21,8 @@ from .smrf import (
     CellMeans,
     FilterOptions,
     GroundPoints,
-    add_ground,
+    ground_means,
     ground_raster,
-    means_of,
 )
 from .surface import GroundRaster, cells_around, heights_above, surface
 from .surface import reach as planes_reach
@@ -142,7 +141,11 @@ def around_blocks(
     options: FilterOptions,
 ) -> NDArray[np.float64]:
     """Return the points that blocks around need: the lowest of each cell (n, 3), meters."""
-    low = lowest_of_cells(x, y, z, use, options.cell)
+    rows = np.flatnonzero(use & (np.abs(z) < HIGHEST))
+    x, y, z = x[rows], y[rows], z[rows]
+    key = cell_keys(cell_numbers(x, options.cell), cell_numbers(y, options.cell))
+    cells, number = np.unique(key, return_inverse=True)
+    low = lowest_points(x, y, z, number, len(cells))
     return np.column_stack([axis[low] for axis in (x, y, z)])
 
 
@@ -171,7 +174,7 @@ def cells_of_block(
     # With a ring around: points blend the four cells around them.
     kept = core.padded(1).intersect(raster.window)
     raster, planes = raster.cut(kept), planes[kept.slices_in(raster.window)].copy()
-    means = _ground_means(points, planes, kept, options)
+    means = ground_means(_judged(points, planes, kept, options), options.cell, kept)
     return GroundCells(_records(raster, core, means, options.requested_radii))
 
 
@@ -181,25 +184,18 @@ def _in_cells(xyz: NDArray[np.float64], options: FilterOptions) -> GroundPoints:
     return GroundPoints.in_cells(x, y, z, np.ones(len(x), bool), options.cell)
 
 
-def _ground_means(
+def _judged(
     parts: Iterable[NDArray[np.float64]],
     planes: NDArray[np.float64],
     window: GridWindow,
     options: FilterOptions,
-) -> CellMeans:
-    """Find the ground among points by the planes of a window; return its means by cell.
-
-    Parts of points are (n, 3), planes (h, w, 3).
-    """
-    cell, corner = options.cell, window[:2]
-    count, place = np.zeros(window.shape, np.int64), np.zeros((*window.shape, 3))
+) -> Iterator[tuple[GroundPoints, NDArray[np.bool_]]]:
+    """Yield parts of points (n, 3), and which are ground by the planes (h, w, 3) of a window."""
     for xyz in parts:
         points = _in_cells(xyz, options)
         height, gradient = np.empty((2, len(xyz)))
-        heights_above(*points[:3], cell, corner, planes, height, gradient)
-        is_ground = options.is_ground(points.use, height, gradient)
-        add_ground(points, is_ground, cell, corner, count, place)
-    return means_of(count, place), place
+        heights_above(*points[:3], options.cell, window[:2], planes, height, gradient)
+        yield points, options.is_ground(points.use, height, gradient)
 
 
 def _records(

@@ -17,7 +17,7 @@ Parameters have SMRF's defaults but for two. `slope` is 0.1, there 0.15: it lowe
 27 surveys from 0.67 to 0.58, and of the ISPRS samples from 3.59 to 3.37; beside 0.12, of the
 surveys thinned to 1 point/m2 from 1.27 to 1.12. `threshold` is 0.4, there 0.5: with cells regained
 among ground it lowers these three means to 0.55, 3.16 and 1.01. One more survey, rocks that rise
-from the sea, is left out: its error is 77.2, and 72.4 with slope 0.15 (docs/results/ablation.md).
+from the sea, is left out: its error is 77.2, and 73.2 with slope 0.15 (docs/results/ablation.md).
 What lies beyond the cloud's end or in a hole is unknown, and no evidence for an object. Roofs wider
 than the window stay ground: a classifier tells them by heights above openings of other widths.
 
@@ -38,16 +38,15 @@ from ..base.grid import GridWindow
 from ..base.threads import map_blocks
 from .cells import HIGHEST, HOLE, columns, usable
 from .ground_blocks import GroundCells
-from .openings import FILL_RINGS, above_opening, fill_holes, opening_names, openings_of
+from .openings import FILL_RINGS, fill_holes, opening_names, openings_of
 from .pieces import patches
 from .smrf import (
     RIM,
     CellMeans,
     FilterOptions,
     GroundPoints,
-    add_ground,
+    ground_means,
     ground_raster,
-    means_of,
     minimum_grid,
 )
 from .surface import GroundRaster, cells_around, heights_above, surface
@@ -200,22 +199,13 @@ def _given_pieces(
     for rows, core in patches(points.column, points.row, options.reach_of_given, options.link):
         part = points.take(rows)
         window = GridWindow.enclosing(part.column, part.row).padded(margin)
-        held, place = means = _means(part, ground[rows], options.cell, window)
+        held, place = means = ground_means([(part, ground[rows])], options.cell, window)
         heights = np.where(held, place[..., 2], HOLE).astype(np.float32)
         opened = {}
         if options.openings:  # of all points, without low outliers
             _, lowest, _ = minimum_grid(part, window, options.cell)
             opened = dict(openings_of(fill_holes(lowest), {*options.requested_radii}))
         yield _Piece(rows, core, GroundRaster(window, heights, place, held, heights, opened), means)
-
-
-def _means(
-    points: GroundPoints, is_ground: NDArray[np.bool_], cell: float, window: GridWindow
-) -> CellMeans:
-    """Return which cells of a window hold points that are ground, and their means."""
-    count, place = np.zeros(window.shape, np.int64), np.zeros((*window.shape, 3))
-    add_ground(points, is_ground, cell, window[:2], count, place)
-    return means_of(count, place), place
 
 
 def _measure(
@@ -234,30 +224,31 @@ def _measure(
     raster, cell, corner = piece.raster, options.cell, piece.raster.window[:2]
     needed = cells_around(raster.window, column, row)
     planes = surface(raster, options.near_levels, needed)
-    height, gradient = np.empty((2, len(x)))
     spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
 
-    def measure_from_surface(s: slice) -> None:
-        heights_above(x[s], y[s], z[s], cell, corner, planes, height[s], gradient[s])
+    def above(planes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        height, gradient = np.empty((2, len(x)))
 
-    list(map_blocks(measure_from_surface, spans, threads))
-    is_ground = options.is_ground(points.use, height, gradient)
-    held, place = piece.means or _means(points, is_ground, cell, raster.window)
+        def measure(s: slice) -> None:
+            heights_above(x[s], y[s], z[s], cell, corner, planes, height[s], gradient[s])
+
+        list(map_blocks(measure, spans, threads))
+        return height, gradient
+
+    is_ground = options.is_ground(points.use, *above(planes))
+    held, place = piece.means or ground_means([(points, is_ground)], cell, raster.window)
     raster = replace(raster, ground=held, place=place)
-    surface(raster, options.far_levels, needed, planes)
-    list(map_blocks(measure_from_surface, spans, threads))
+    height, gradient = above(surface(raster, options.far_levels, needed, planes))
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[piece.core]))
     height[nowhere] = gradient[nowhere] = 0.0
     out: dict[str, NDArray] = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
     if options.slope_too:
         out["Slope"] = np.degrees(np.arctan(gradient))
+    planes[:] = 0.0
     for name, radius in zip(opening_names(options.openings), options.requested_radii, strict=True):
-        values = out[name] = np.empty(len(x), np.float32)
-        opening = raster.opened[radius]
-
-        def measure_from_opening(s: slice, opening=opening, values=values) -> None:
-            above_opening(x[s], y[s], z[s], cell, corner, opening, height[s], values[s])
-
-        list(map_blocks(measure_from_opening, spans, threads))
+        opened = raster.opened[radius]
+        planes[..., 0] = np.where(np.isfinite(opened), opened, np.nan)
+        values, _ = above(planes)
+        out[name] = np.where(np.isnan(values), height, values).astype(np.float32)
     return out

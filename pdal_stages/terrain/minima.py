@@ -12,6 +12,7 @@ multi-class classification for object extraction from airborne laser scanning po
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,88 +23,35 @@ from ..base.grid import cell_keys, cell_numbers, places_among
 from .cells import columns, usable
 
 
-class MinimaTerrain:
-    """Coarse terrain of a cloud, which :meth:`at` evaluates; parameters as of :func:`hag_minima`.
+def _filled(
+    keys: NDArray[np.int64],
+    minima: NDArray[np.float64],
+    wanted: NDArray[np.int64],
+    cell: float,
+    figures: dict[str, Any],
+) -> NDArray[np.float64]:
+    """Return the values of cells; empty ones from the filled ones about as near as the nearest.
 
-    The `figures` count ``cells`` (with points), ``interpolated_cells`` (empty ones that were
-    needed), ``farthest_fill`` (distance to the nearest filled cell, the worst case),
-    ``unused_points`` (not finite, or excluded by the mask).
+    Weights are one over the fourth power of the distance between cell centers. [W18] does not say
+    what becomes of empty cells.
     """
+    place, there = places_among(keys, wanted)
+    values, empty = minima[place], np.flatnonzero(~there)
+    if empty.size:
+        from scipy.spatial import cKDTree  # most clouds have no gaps: not loaded at start
 
-    def __init__(
-        self,
-        x: ArrayLike,
-        y: ArrayLike | None = None,
-        z: ArrayLike | None = None,
-        *,
-        cell: float = 20.0,
-        resolution: float = 0.5,
-        mask: ArrayLike | None = None,
-    ) -> None:
-        check_sizes(cell, resolution)
-        self.cell, self.resolution = float(cell), float(resolution)
-        x, y, z = columns(x, y, z)
-        use = usable(x, y, z, mask=mask)
-        key = cell_keys(cell_numbers(x[use], cell), cell_numbers(y[use], cell))
-        self.keys, number = np.unique(key, return_inverse=True)
-        self.minima = np.full(len(self.keys), np.inf)
-        np.minimum.at(self.minima, number, z[use])
-        self.figures: dict[str, float] = {
-            "cells": len(self.keys),
-            "interpolated_cells": 0,
-            "farthest_fill": 0.0,
-            "unused_points": int(x.size - np.count_nonzero(use)),
-        }
-
-    def at(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Return the terrain height of points: bilinear, at the center of their fine cell.
-
-        NaN for points that are not finite.
-
-        NoTerrainError if no point formed a terrain.
-        """
-        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
-        out = np.full(x.shape, np.nan)
-        finite = usable(x, y)
-        if not finite.any():
-            return out
-        if self.keys.size == 0:
-            raise NoTerrainError(
-                "no terrain: none of the points may form one",
-                found=f"{x.size:,} points, all of them not finite, noise, or outside 'where'",
-                cure="Relax 'ignore' or 'where'",
-            )
-        corners, s, t = _corners(x[finite], y[finite], self.cell, self.resolution)
-        keys, place = np.unique(corners, return_inverse=True)
-        z00, z10, z01, z11 = self._filled(keys)[place.reshape(corners.shape)]
-        lower = z00 + (z10 - z00) * s
-        upper = z01 + (z11 - z01) * s
-        out[finite] = lower + (upper - lower) * t
-        return out
-
-    def _filled(self, keys: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the values of cells; empty ones from the filled ones about as near as the nearest.
-
-        Weights are one over the fourth power of the distance between cell centers. [W18] does not
-        say what becomes of empty cells.
-        """
-        place, there = places_among(self.keys, keys)
-        values, empty = self.minima[place], np.flatnonzero(~there)
-        if empty.size:
-            from scipy.spatial import cKDTree  # most clouds have no gaps: not loaded at start
-
-            filled_at, wanted_at = _places(self.keys), _places(keys[empty])
-            tree = cKDTree(filled_at)
-            nearest = tree.query(wanted_at)[0]
-            # All filled cells within reach of the nearest one: a set, so the outcome
-            # does not depend on how a search tree orders equal distances.
-            for at, center, radius in zip(empty, wanted_at, nearest + _FILL, strict=True):
-                near = np.sort(tree.query_ball_point(center, radius))
-                weight = 1.0 / ((filled_at[near] - center) ** 2).sum(axis=1) ** 2
-                values[at] = np.dot(weight, self.minima[near]) / weight.sum()
-            self.figures["interpolated_cells"] = int(empty.size)
-            self.figures["farthest_fill"] = float(nearest.max() * self.cell)
-        return values
+        filled_at, wanted_at = _places(keys), _places(wanted[empty])
+        tree = cKDTree(filled_at)
+        nearest = tree.query(wanted_at)[0]
+        # All filled cells within reach of the nearest one: a set, so the outcome does not depend
+        # on how a search tree orders equal distances.
+        for at, center, radius in zip(empty, wanted_at, nearest + _FILL, strict=True):
+            near = np.sort(tree.query_ball_point(center, radius))
+            weight = 1.0 / ((filled_at[near] - center) ** 2).sum(axis=1) ** 2
+            values[at] = np.dot(weight, minima[near]) / weight.sum()
+        figures["interpolated_cells"] = int(empty.size)
+        figures["farthest_fill"] = float(nearest.max() * cell)
+    return values
 
 
 #: An empty cell is filled from those at most this much farther away than the nearest one, in cells.
@@ -134,6 +82,8 @@ def hag_minima(
     cell: float = 20.0,
     resolution: float = 0.5,
     mask: ArrayLike | None = None,
+    wanted: ArrayLike | None = None,
+    figures: dict[str, Any] | None = None,
 ) -> NDArray[np.float64]:
     """Compute the height of every point above the coarse terrain of the cloud [W18 section 3.2].
 
@@ -148,11 +98,17 @@ def hag_minima(
         Side of the fine cells on which the terrain is evaluated.
     mask : array_like of bool, shape (n,), optional
         Points that may form the terrain, e.g. all but noise.
+    wanted : array_like of bool, shape (n,), optional
+        Points whose heights are wanted; the others get NaN.
+    figures : dict, optional
+        Receives ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed),
+        ``farthest_fill`` (distance to the nearest filled cell, the worst case), ``unused_points``
+        (not finite, or excluded by the mask).
 
     Returns
     -------
     ndarray of float64, shape (n,)
-        z minus terrain; NaN only where a coordinate is not finite.
+        z minus terrain; NaN where a coordinate is not finite.
 
     Raises
     ------
@@ -166,8 +122,33 @@ def hag_minima(
     >>> hag_minima([1.0, 2.0], [1.0, 2.0], [10.0, 13.5]).tolist()
     [0.0, 3.5]
     """
+    check_sizes(cell, resolution)
     x, y, z = columns(x, y, z)
-    return z - MinimaTerrain(x, y, z, cell=cell, resolution=resolution, mask=mask).at(x, y)
+    use, found = usable(x, y, z, mask=mask), usable(x, y, mask=wanted)
+    key = cell_keys(cell_numbers(x[use], cell), cell_numbers(y[use], cell))
+    keys, number = np.unique(key, return_inverse=True)
+    minima = np.full(len(keys), np.inf)
+    np.minimum.at(minima, number, z[use])
+    figures = {} if figures is None else figures
+    figures |= {"cells": len(keys), "interpolated_cells": 0, "farthest_fill": 0.0}
+    figures["unused_points"] = int(x.size - np.count_nonzero(use))
+    out = np.full(x.shape, np.nan)
+    if not found.any():
+        return out
+    if not len(keys):
+        raise NoTerrainError(
+            "no terrain: none of the points may form one",
+            found=f"{x.size:,} points, all of them not finite, noise, or outside 'where'",
+            cure="Relax 'ignore' or 'where'",
+        )
+    corners, s, t = _corners(x[found], y[found], cell, resolution)
+    needed, place = np.unique(corners, return_inverse=True)
+    terrain = _filled(keys, minima, needed, cell, figures)
+    z00, z10, z01, z11 = terrain[place.reshape(corners.shape)]
+    lower = z00 + (z10 - z00) * s
+    upper = z01 + (z11 - z01) * s
+    out[found] = z[found] - (lower + (upper - lower) * t)
+    return out
 
 
 def terrain_reach(

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.asprs import NOISE
 from ..base.grid import begins_run, cell_numbers
 from ..base.jit import device, njit
-from .cells import HIGHEST, columns, sums_around, usable
+from .cells import HIGHEST, columns, usable
 from .components import longest_sides, number_sets
 from .low_outliers import RULES as LOW_RULES
 from .low_outliers import limits_below_ground
@@ -217,8 +217,14 @@ def density(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     size = -(-(int(block.max()) + 1) // wide) * wide
     points = np.bincount(block, voxels.counts, size).astype(np.int64).reshape(-1, wide)
     full = np.bincount(block[begins_run(voxels.keys >> BITS)], minlength=size).reshape(-1, wide)
-    points, full, blocks = (sums_around(v, 1).ravel()[block] for v in (points, full, full > 0))
+    points, full, blocks = (_sum_around(v).ravel()[block] for v in (points, full, full > 0))
     return points / full, np.sqrt(blocks * (BLOCK * SIDE) ** 2 / points)
+
+
+def _sum_around(values: NDArray) -> NDArray[np.int64]:
+    """Sum whole numbers (h, w) over the 3 x 3 places around each."""
+    (h, w), padded = values.shape, np.pad(values.astype(np.int64), 1)
+    return sum((padded[j : j + h, i : i + w] for j in range(3) for i in range(3)), np.int64(0))
 
 
 def _small(voxels: Voxels, per_column: NDArray[np.float64] | float, most: int) -> NDArray[np.bool_]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,15 +56,6 @@ class GroundRaster:
         }
         opened = {radius: values[part].copy() for radius, values in self.opened.items()}
         return replace(self, window=window, opened=opened, **rasters)
-
-
-class Planes(NamedTuple):
-    """Planes of blocks of 2 x 2 cells; a NamedTuple, as kernels read it."""
-
-    #: (h, w, 3) at the centers: height, gradient per cell; NaN where nothing is known
-    values: np.ndarray
-    left: int  #: number of the first column
-    bottom: int  #: of the first row
 
 
 def reach(levels: int) -> int:
@@ -256,8 +246,13 @@ def _fit(moments, size, needed, planes):
             planes[j, i, 2] = along + gy
 
 
-def planes_of_blocks(raster: GroundRaster, levels: int, needed: NDArray[np.bool_]) -> Planes:
+def planes_of_blocks(
+    raster: GroundRaster, levels: int, needed: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], tuple[int, int]]:
     """Fit planes of blocks of 2 x 2 cells through the ground of a raster.
+
+    Returns height and gradient per cell at the blocks' centers (h, w, 3), NaN where nothing is
+    known, and the first column and row of blocks.
 
     There are `levels` coarser levels, at least 1. Only the planes that cells `needed` (h, w) blend
     have values: a thin cloud costs what its points do, not what its area does.
@@ -290,7 +285,7 @@ def planes_of_blocks(raster: GroundRaster, levels: int, needed: NDArray[np.bool_
             coarser, planes = planes, np.empty((*sums.shape[:2], 3))
             _finer(coarser, *spans[level + 1], 2.0**level, *spans[level], wanted[level], planes)
         _fit(sums, 2.0**level, wanted[level], planes)
-    return Planes(planes, *spans[1])
+    return planes, spans[1]
 
 
 def surface(
@@ -307,10 +302,10 @@ def surface(
     overwritten where they are given.
     """
     ground, place = raster.ground, raster.place
-    blocks = planes_of_blocks(raster, levels, needed)
+    blocks, corner = planes_of_blocks(raster, levels, needed)
     if planes is None:
         planes = np.zeros((*ground.shape, 3))
-    _finer(blocks.values, blocks.left, blocks.bottom, 1.0, *raster.window[:2], needed, planes)
+    _finer(blocks, *corner, 1.0, *raster.window[:2], needed, planes)
     # Those of ground cells hold their cell's ground.
     j, i = np.nonzero(ground & needed)
     rise = place[j, i, :2] * planes[j, i, 1:]
