@@ -67,7 +67,7 @@ class HagMinima(Stage):
         if points.mask is not None and not points.mask.any():  # which the report says
             return {}
         wanted = points.wanting("HeightAboveGround", context.created_before)
-        found = hag_minima(
+        heights = hag_minima(
             *(x, y, z),
             cell=self.cell,
             resolution=self.resolution,
@@ -76,5 +76,5 @@ class HagMinima(Stage):
             figures=points.report.figures,
         )
         height = np.array(points.arrays["HeightAboveGround"], np.float64)
-        height[wanted] = found[wanted] / points.units.vertical
+        height[wanted] = heights[wanted] / points.units.vertical
         return {"HeightAboveGround": height}

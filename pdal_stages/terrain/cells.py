@@ -23,8 +23,8 @@ def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDAr
 
     StageError where shapes differ.
     """
-    given: Any = np.asarray(x).T if y is None and z is None else (x, y, z)
-    axes = [np.asarray(axis, np.float64, order="C") for axis in given]
+    three: Any = np.asarray(x).T if y is None and z is None else (x, y, z)
+    axes = [np.asarray(axis, np.float64, order="C") for axis in three]
     if len(axes) != 3 or axes[0].ndim != 1 or len({axis.shape for axis in axes}) > 1:
         raise StageError(
             "points must be an array of shape (n, 3), or x, y and z of one length",

@@ -24,19 +24,16 @@ from .cells import columns, usable
 
 
 def _filled(
-    keys: NDArray[np.int64],
-    minima: NDArray[np.float64],
-    wanted: NDArray[np.int64],
-    cell: float,
-    figures: dict[str, Any],
-) -> NDArray[np.float64]:
+    keys: NDArray[np.int64], minima: NDArray[np.float64], wanted: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], int, float]:
     """Return the values of cells; empty ones from the filled ones about as near as the nearest.
 
-    Weights are one over the fourth power of the distance between cell centers. [W18] does not say
-    what becomes of empty cells.
+    Also how many were empty, and the largest distance to a filled one, in cells. Weights are one
+    over the fourth power of the distance between cell centers. [W18] does not say what becomes of
+    empty cells.
     """
     place, there = places_among(keys, wanted)
-    values, empty = minima[place], np.flatnonzero(~there)
+    values, empty, farthest = minima[place], np.flatnonzero(~there), 0.0
     if empty.size:
         from scipy.spatial import cKDTree  # most clouds have no gaps: not loaded at start
 
@@ -49,9 +46,8 @@ def _filled(
             near = np.sort(tree.query_ball_point(center, radius))
             weight = 1.0 / ((filled_at[near] - center) ** 2).sum(axis=1) ** 2
             values[at] = np.dot(weight, minima[near]) / weight.sum()
-        figures["interpolated_cells"] = int(empty.size)
-        figures["farthest_fill"] = float(nearest.max() * cell)
-    return values
+        farthest = float(nearest.max())
+    return values, int(empty.size), farthest
 
 
 #: An empty cell is filled from those at most this much farther away than the nearest one, in cells.
@@ -90,50 +86,37 @@ def hag_minima(
     Parameters
     ----------
     x, y, z : array_like, shape (n,)
-        Coordinates in meters (or any one unit, with `cell` and `resolution` in it too); or `x`
-        alone, of shape (n, 3).
-    cell : float, default 20
-        Side of the coarse cells whose lowest points form the terrain.
-    resolution : float, default 0.5
-        Side of the fine cells on which the terrain is evaluated.
-    mask : array_like of bool, shape (n,), optional
-        Points that may form the terrain, e.g. all but noise.
-    wanted : array_like of bool, shape (n,), optional
-        Points whose heights are wanted; the others get NaN.
+        Coordinates in one unit, that of `cell` and `resolution`; or `x` alone, of shape (n, 3).
+    cell, resolution : float
+        Sides of the coarse cells whose lowest points form the terrain, and of the fine ones.
+    mask, wanted : array_like of bool, shape (n,), optional
+        Points that may form the terrain, e.g. all but noise; points whose heights are wanted.
     figures : dict, optional
         Receives ``cells`` (with points), ``interpolated_cells`` (empty ones that were needed),
-        ``farthest_fill`` (distance to the nearest filled cell, the worst case), ``unused_points``
-        (not finite, or excluded by the mask).
+        ``farthest_fill`` (largest distance of these to a filled one), ``unused_points``.
 
     Returns
     -------
     ndarray of float64, shape (n,)
-        z minus terrain; NaN where a coordinate is not finite.
+        z minus terrain; NaN where a coordinate is not finite, and for points that are not wanted.
 
     Raises
     ------
-    OptionError
-        If a size is not positive, or `resolution` is larger than `cell`.
-    StageError
-        If no point may form the terrain, or shapes differ.
-
-    Examples
-    --------
-    >>> hag_minima([1.0, 2.0], [1.0, 2.0], [10.0, 13.5]).tolist()
-    [0.0, 3.5]
+    OptionError, StageError
+        For wrong sizes and shapes, and where no point may form the terrain.
     """
     check_sizes(cell, resolution)
     x, y, z = columns(x, y, z)
-    use, found = usable(x, y, z, mask=mask), usable(x, y, mask=wanted)
+    use, rows = usable(x, y, z, mask=mask), usable(x, y, mask=wanted)
     key = cell_keys(cell_numbers(x[use], cell), cell_numbers(y[use], cell))
     keys, number = np.unique(key, return_inverse=True)
     minima = np.full(len(keys), np.inf)
     np.minimum.at(minima, number, z[use])
-    figures = {} if figures is None else figures
-    figures |= {"cells": len(keys), "interpolated_cells": 0, "farthest_fill": 0.0}
-    figures["unused_points"] = int(x.size - np.count_nonzero(use))
+    counts = {} if figures is None else figures
+    counts |= {"cells": len(keys), "interpolated_cells": 0, "farthest_fill": 0.0}
+    counts["unused_points"] = int(np.count_nonzero(~use))
     out = np.full(x.shape, np.nan)
-    if not found.any():
+    if not rows.any():
         return out
     if not len(keys):
         raise NoTerrainError(
@@ -141,13 +124,12 @@ def hag_minima(
             found=f"{x.size:,} points, all of them not finite, noise, or outside 'where'",
             cure="Relax 'ignore' or 'where'",
         )
-    corners, s, t = _corners(x[found], y[found], cell, resolution)
+    corners, s, t = _corners(x[rows], y[rows], cell, resolution)
     needed, place = np.unique(corners, return_inverse=True)
-    terrain = _filled(keys, minima, needed, cell, figures)
-    z00, z10, z01, z11 = terrain[place.reshape(corners.shape)]
-    lower = z00 + (z10 - z00) * s
-    upper = z01 + (z11 - z01) * s
-    out[found] = z[found] - (lower + (upper - lower) * t)
+    values, counts["interpolated_cells"], farthest = _filled(keys, minima, needed)
+    counts["farthest_fill"] = farthest * cell
+    south, north = (a + (b - a) * s for a, b in values[place.reshape(2, 2, -1)])
+    out[rows] = z[rows] - (south + (north - south) * t)
     return out
 
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ..base.jit import njit
 from .cells import HOLE
 
-#: Cells beyond measured ones, along both axes and diagonals, up to which holes are filled. Clips with
-#: holes lose 0.3 points with 2, surveys 0.4 with 8, and both kinds and the ISPRS samples without.
+#: Cells beyond measured ones, along both axes and diagonals, up to which holes are filled. Clips
+#: with holes lose 0.3 points with 2, surveys 0.4 with 8, and clips and the ISPRS samples without.
 FILL_RINGS = 3
 
 
