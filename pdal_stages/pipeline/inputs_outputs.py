@@ -95,11 +95,6 @@ def locations(path: str, column: str = "location") -> list[str]:
     return [str(file if file.exists() else Path(name).absolute()) for name, file in there.items()]
 
 
-def is_ept(name: str) -> bool:
-    """Return whether an input is an EPT source."""
-    return name.startswith("ept://") or Path(name).name == EPT
-
-
 def ept_address(name: str) -> str:
     """Return the path or address of the description of an EPT source."""
     name = name.removeprefix("ept://")

@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 from ..base.errors import DependencyError, PipelineError
 from ..base.las import header_there, named_copc, named_las, source_id
 from ..base.las_check import CURE_OF_DAMAGE, check_readable
-from ..base.las_repair import LARGEST_HEAD, corrected
+from ..base.las_repair import corrected
 from .inputs_outputs import readers_files, writers_outputs
 
 INSTALL = (
@@ -176,11 +176,10 @@ def execute(
 
 
 @contextlib.contextmanager
-def readable(stages: list[dict[str, Any]], points: bool = True) -> Iterator[list[dict[str, Any]]]:
+def readable(stages: list[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
     """Yield the stages with corrected copies in place of LAS files that PDAL cannot read.
 
     See :mod:`..base.las_repair`. The copies lie beside what is written, and are removed on leaving.
-    Without `points` they hold what stands before the points.
     """
     beside = [os.path.dirname(output.path) for output in writers_outputs(stages)][:1]
     folder = next(filter(os.path.isdir, beside), None)
@@ -197,19 +196,14 @@ def readable(stages: list[dict[str, Any]], points: bool = True) -> Iterator[list
                 streams.append(corrected(path, reads_extra and described))
             if any(streams):
                 copies = tempfile.TemporaryDirectory(prefix=".pdal-stages-input-", dir=folder)
-                name = _copy_corrected(stack.enter_context(copies), paths, streams, points)
+                name = _copy_corrected(stack.enter_context(copies), paths, streams)
                 stage = {**stage, "filename": name}
             out.append(stage)
         yield out
 
 
-def _copy_corrected(
-    folder: str, paths: list[str], streams: Sequence[Any], with_points: bool
-) -> str:
-    """Copy corrected files into a folder, with links to the others; return a pattern of them all.
-
-    Without their points the rest of the files is a hole.
-    """
+def _copy_corrected(folder: str, paths: list[str], streams: Sequence[Any]) -> str:
+    """Copy corrected files into a folder, with links to others; return a pattern of all."""
     for number, (path, stream) in enumerate(zip(paths, streams, strict=True)):
         suffix = ".laz" if path.lower().endswith("z") else ".las"
         name = os.path.join(folder, f"{number:06}{suffix}")
@@ -217,11 +211,7 @@ def _copy_corrected(
             os.symlink(os.path.abspath(path), name)
             continue
         with stream, open(name, "xb") as copy:
-            if with_points:
-                shutil.copyfileobj(stream, copy, 1 << 20)
-            else:
-                copy.write(stream.read(LARGEST_HEAD))
-                copy.truncate(stream.seek(0, os.SEEK_END))
+            shutil.copyfileobj(stream, copy, 1 << 20)
     return name if len(paths) == 1 else os.path.join(folder, "*")
 
 
@@ -288,7 +278,7 @@ def _log(pipeline: Any) -> str:
 
 def validate(stages: list[dict[str, Any]]) -> None:
     """Let the program `pdal` check stages and their options, without reading points."""
-    with readable(stages, points=False) as copies:
+    with readable(stages) as copies:
         text = json.dumps({"pipeline": for_this_version(copies)})
         done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
     output = (done.stderr or done.stdout).strip()

@@ -43,9 +43,7 @@ class _Family:
             expanded = expand_stage({"type": kind.type, **unwired})
             runtime.remember_stdout()
             merging = [{"type": "filters.merge", **wired}] if merge else []
-            values = ", ".join(f"{key}={value!r}" for key, value in options.items())
-            shown = f"{kind.type}({values})"
-            joined = _joined([*merging, expanded.plain], shown, expanded)
+            joined = _joined([*merging, expanded.plain], expanded)
             joined.type, joined.tag = kind.type, options.get("tag")
             joined.options = {"type": kind.type, **options}
             return joined
@@ -73,16 +71,12 @@ def _signature(kind: type[Stage]) -> inspect.Signature:
     return inspect.Signature(parameters)
 
 
-def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.ExpandedStage):
+def _joined(stages: list[dict[str, Any]], made_from: runtime.ExpandedStage):
     """Return the filters that PDAL runs as one object, which joins others by ``|``.
 
     `made_from` is kept as long as they are.
     """
     pdal = pdal_env.bindings()
-
-    class Step(pdal.Filter):  # type: ignore[name-defined]
-        def __repr__(self) -> str:
-            return shown
 
     class Filter(pdal.Pipeline):  # type: ignore[name-defined]
         def pipeline(self, *arrays, loglevel: int = logging.ERROR):
@@ -97,12 +91,9 @@ def _joined(stages: list[dict[str, Any]], shown: str, made_from: runtime.Expande
         def __copy__(self):
             return self.pipeline(loglevel=self.loglevel)
 
-        def __repr__(self) -> str:
-            return shown
-
     joined = Filter()
     for stage in stages:
-        step = Step(**stage)
+        step = pdal.Filter(**stage)
         step.made_from = made_from
         joined |= step
     return joined
