@@ -82,8 +82,8 @@ def test_it_is_said_that_there_is_no_score_and_what_to_label_next(tmp_path, writ
         == 0
     )
     output = capsys.readouterr()
-    assert "there is no score on ground held out" in output.err and "6 Building" in output.err
-    assert "Label next" in output.err and "not scored" in output.out
+    assert "there is no score on ground held out" in output.err and "class 6" in output.err
+    assert "Label in more places" in output.err and "not scored" in output.out
     info = ps.load_model(tmp_path / "m.model").info
     assert info["accuracy"]["cross_validation"] is None and "sureness" not in info
     assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS,

@@ -9,7 +9,6 @@ import pytest
 from block_scene import QUICK_TRAINING
 
 import pdal_stages as ps
-from pdal_stages.base.errors import DimensionError
 from pdal_stages.cli import main
 
 QUICK = {"feature_set": "Linearity,HeightRange", "trees": 8, "passes": 1, "dimensions": ""}
@@ -33,55 +32,14 @@ def test_train_takes_folders_and_says_an_honest_score_first(tmp_path, write_las,
     (tmp_path / "in").mkdir()
     for number in range(2):
         write_las(tmp_path / "in" / f"t{number}.laz", scene(number, 60.0 * number), point_format=1)
-    assert main(words(tmp_path, tmp_path / "in")) == 0
+    code = main(words(tmp_path, tmp_path / "in"))
     out, err = capsys.readouterr()
-    assert out.startswith("files held out")
-    assert "files held out" not in err  # once is enough
+    assert code == 0, err
+    assert out.startswith("blocks held out")
+    assert "blocks held out" not in err  # once is enough
     assert "t0.laz, t1.laz" in out
     score = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
-    assert (score["by"], score["folds"]) == ("groups", 2) and score["chosen"]["trees"] == 2
-
-
-@pytest.mark.pdal
-def test_a_class_in_one_file_alone(tmp_path, write_las, capsys):
-    """Held out with its file it would not be known: blocks instead, and a word on why."""
-    first, other = scene(1), scene(2, 60.0)
-    other["Classification"][other["Classification"] == 6] = 5
-    files = [
-        write_las(tmp_path / name, points, point_format=1)
-        for name, points in (("a.laz", first), ("b.laz", other))
-    ]
-    assert main(words(tmp_path, *files)) == 0
-    out = capsys.readouterr()
-    assert out.out.startswith("blocks held out")
-    assert "blocks are held out, not files: without fold" in out.err
-
-
-@pytest.mark.pdal
-def test_groups_of_a_pipeline_or_of_an_array(tmp_path, write_las, run_job):
-    points = scene(3)
-    points["PointSourceId"] = (points["X"] // 15 + 40).astype("u2")
-    cloud = write_las(tmp_path / "a.laz", points, point_format=1)
-    writer = {
-        "type": "writers.classifiermodel",
-        "filename": str(tmp_path / "m.model"),
-        "neighborhoods": "k8",
-    }
-    writer |= {"count": 100, "groups": "PointSourceId", **QUICK}
-    code, _, err = run_job([cloud, writer])
-    assert code == 0 and "PointSourceId held out" in err
-    score = ps.load_model(tmp_path / "m.model").info["accuracy"]["cross_validation"]
-    assert (score["groups"], score["folds"], score["gap"]) == ("PointSourceId", 4, 0.0)
-
-    xyz = np.column_stack([points[k] for k in "XYZ"])
-    quick = {**QUICK, "dimensions": (), "passes": 2, "folds": 3}
-    options = ps.TrainingOptions("k8", **quick, count=100, groups="Tile")
-    dimensions = {"Tile": points["PointSourceId"], "HeightAboveGround": points["Z"]}
-    model = ps.train(xyz, points["Classification"], options, dimensions=dimensions, progress=False)
-    assert model.info["accuracy"]["cross_validation"]["folds"] == 3
-    assert "Tile" not in model.required_dimensions
-    with pytest.raises(DimensionError, match="Tile"):
-        ps.train([ps.TrainingCloud(xyz, points["Classification"])], options, progress=False)
+    assert (score["by"], score["folds"]) == ("blocks", 5) and score["chosen"]["trees"] == 2
 
 
 def test_surveys_are_held_out_where_there_are_several():

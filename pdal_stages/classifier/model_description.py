@@ -11,8 +11,6 @@ from .calibration import Calibration
 if TYPE_CHECKING:
     from .model import Model
 
-#: The dimension in which the command `train` numbers its files.
-FILE_NUMBER = "FileNumber"
 #: Most surveys that the text names, and most inputs by importance.
 _SURVEYS = 40
 _TOP = 10
@@ -143,15 +141,9 @@ def score(info: Mapping[str, Any]) -> str:
         return f"not scored     {info['training'].get('unscored', why)}"
     label = "ground held out, which chose the best epoch"
     if crossed := info["accuracy"]["cross_validation"]:
-        by = crossed.get("by", "blocks")
-        label = f"{groups_word(str(crossed.get('groups'))) if by == 'groups' else by} held out"
+        label = f"{crossed.get('by', 'blocks')} held out"
     values = [_percent(row.get(name)) for name in ("overall_accuracy", "kappa", "mean_f1")]
     return "{:<15}  overall accuracy {}, kappa {}, mean F1 {}".format(label, *values)
-
-
-def groups_word(dimension: str) -> str:
-    """Return the word for the groups that a dimension numbers."""
-    return "files" if dimension == FILE_NUMBER else dimension
 
 
 def _percent(value: Any) -> str:

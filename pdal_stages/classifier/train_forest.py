@@ -22,7 +22,7 @@ from .auto_context import FoldForests, WeightedPass, sample_context
 from .calibration import Calibration
 from .context_features import Context
 from .feature_forest import Blend, CloudFeatures, FeatureForest, Features
-from .input_dimensions import OPTIONAL_DIMENSIONS, required_dimensions, take_dimensions
+from .input_dimensions import OPTIONAL_DIMENSIONS
 from .interface import PredictRequest, weigh
 from .model import Model
 from .random_forest import Forest, grow_forest
@@ -39,10 +39,6 @@ PASS_FOLDS = 5
 #: Labeled points of the rarest class with which a forest counts as much as its base (not
 #: tuned).
 EVEN = 30
-#: Key of the count of samples of tiles whose nearest neighbors lie beyond the halo of their
-#: features.
-SHORT = "short_of_neighbors"
-
 #: Options of growing that the model file stores.
 _STORED = (
     *("max_samples", "max_features", "min_samples_leaf", "max_depth"),
@@ -80,8 +76,6 @@ class ForestTraining:
         """Draw samples, and compute their features."""
         self.clouds, self.options, self.base = clouds, options, options.base
         self.progress = partial(Progress, enabled=progress)
-        if options.groups:  # before any work: it may be missing
-            _check_groups(clouds, options.groups)
         self.labeled = label_classes(clouds, options, progress)
         self.codes = self.labeled.classes.codes
         self.surveys = [cloud.survey for cloud in clouds]
@@ -93,8 +87,6 @@ class ForestTraining:
         self.stands_for = weight * frequent[self.samples.label]
         factors = frequent**options.prior_weight
         self.factors = factors / factors.max() if options.prior_weight else None
-        #: samples of tiles whose nearest neighbors lie beyond the halo of their features
-        self.short = 0
         self.features = self._fit_features()
         self.values = self._features_of_samples()
         if options.scaling == "percentiles":
@@ -165,8 +157,6 @@ class ForestTraining:
                 request = PredictRequest(cloud.xyz, cloud.dimensions, rows, o.threads, o.memory_mb)
                 for block in CloudFeatures(self.features, request).blocks(rows, bar):
                     values[at[np.searchsorted(rows, block.rows)]] = block.values
-                if cloud.inside is not None:
-                    self.short += max(request.report.beyond_halo.values(), default=0)
         bad = ~np.isfinite(values).all(axis=0)
         if bad.any():
             raise DimensionError(
@@ -191,7 +181,6 @@ class ForestTraining:
             **{name: getattr(self.growth, name) for name in _STORED},
             **notes,
             **self._held_by_base(),
-            **({SHORT: self.short} if self.short else {}),
         }
         counts = map(self.samples.counts, range(len(self.codes)))
         packages = ("numpy", "scikit-learn", "numba")
@@ -249,30 +238,25 @@ class ForestTraining:
     def _validate(self) -> tuple[dict[str, Any] | None, dict[str, str]]:
         """Return the cross-validation for the manifest, and why there is none.
 
-        It holds out groups or surveys where there are several, else blocks of ground.
+        It holds out surveys where there are several, else blocks of ground.
         """
         o, samples, codes = self.options, self.samples, self.codes
         if o.folds == 0:
             return None, {}
         reaches = (each.reach or 0.0 for each in self.features.plan.neighborhoods)
         gap = max(reaches, default=0.0)
-        group = samples.take(self._groups)
-        names, index = np.unique(group, return_inverse=True)
-        by_groups = {"groups": o.groups} if o.groups else {}
-        for by in (["groups" if o.groups else "surveys"] if len(names) > 1 else []) + ["blocks"]:
-            self.calibration = Calibration(
-                about=f"{by} held out, forests of {self.fold_trees} trees"
-            )
+        names, index = np.unique(np.array(self.surveys)[samples.cloud], return_inverse=True)
+        for by in ["surveys"] * (len(names) > 1) + ["blocks"]:
+            about = f"{by} held out, forests of {self.fold_trees} trees"
+            self.calibration = Calibration(about=about)
             # Surveys do not see each other, whatever their coordinates.
             here = 0.0 if by == "surveys" else gap
             try:
+                fold = (index % o.folds).astype(np.int16)
                 if by == "blocks":
-                    blocks = Folds.of_blocks(
-                        self.xy, samples.label, samples.weight, o.folds, BLOCK_M
-                    )
+                    label, weight = samples.label, samples.weight
+                    blocks = Folds.of_blocks(self.xy, label, weight, o.folds, BLOCK_M)
                     fold = blocks.points(self.xy)
-                else:
-                    fold = (index % o.folds).astype(np.int16)
                 matrix = np.zeros((len(codes), len(codes)), np.int64)
                 each = self._without_each(self.first, fold, "cross-validation", here, len(codes))
                 for rows, forest in each:
@@ -281,20 +265,12 @@ class ForestTraining:
                     self._calibrate(rows, p)
             except OptionError as error:  # too little ground, or a class in one place
                 reason = f"{error.what}: {error.found}"
-                if by == "groups":
-                    by_groups["instead"] = reason
                 continue
             score = {"trees": self.fold_trees, **figures(matrix, codes)}
             cut = {"folds": int(fold.max()) + 1, "block_size": BLOCK_M, "gap": here}
-            return {"by": by, **by_groups, **cut, "chosen": score}, {}
-        return None, {"unscored": self._unscored(reason, gap)}
-
-    def _groups(self, number: int) -> npt.NDArray[Any]:
-        """Return the group (n,) that each of a cloud's points is held out with."""
-        cloud, name = self.clouds[number], self.options.groups
-        if not name:
-            return np.broadcast_to(np.array(cloud.survey), len(cloud))
-        return take_dimensions((name,), cloud.dimensions, len(cloud), where=cloud.name)[name]
+            return {"by": by, **cut, "chosen": score}, {}
+        why = f"there is no score on ground held out: {reason}. Label in more places"
+        return None, {"unscored": why}
 
     def _calibrate(self, rows: npt.NDArray[np.int64], p: npt.NDArray[np.float64]) -> None:
         """Count right and wrong samples that were held out, by reliability."""
@@ -306,23 +282,6 @@ class ForestTraining:
         predicted = np.asarray(codes)[p.argmax(axis=1)]
         true = np.asarray(self.codes)[self.samples.label[rows]]
         self.calibration.add(predicted, true, p.max(axis=1), self.stands_for[rows])
-
-    def _unscored(self, reason: str, gap: float) -> str:
-        """Return why there is no score, and which class to label next, and where.
-
-        It is the class on the fewest blocks of ground.
-        """
-        cell = np.floor(self.xy / BLOCK_M)
-        of_class = [self.samples.label == place for place in range(len(self.codes))]
-        least = int(np.argmin([len(np.unique(cell[rows], axis=0)) for rows in of_class]))
-        xy = self.xy[of_class[least]]
-        x, y = (xy.min(axis=0) + xy.max(axis=0)) / 2
-        return (
-            f"there is no score on ground held out: {reason}. Label next, at least "
-            f"{BLOCK_M + gap:.0f} m away: "
-            f"{self.codes[least]} {self.labeled.classes.names[least]}, which lies around {x:.0f}, "
-            f"{y:.0f}"
-        )
 
     def _passes(self) -> tuple[list[FeatureForest], list[list[float]]]:
         """Grow one forest after the other; each reads the one before on ground it has not seen."""
@@ -403,18 +362,6 @@ class ForestTraining:
             if code not in self.base.codes and held:
                 out[str(code)] = [int(np.count_nonzero(rows)), held]
         return {"held_by_base": out} if out else {}
-
-
-def _check_groups(clouds: Sequence[TrainingCloud], dimension: str) -> None:
-    """Raise an error where the dimension of groups is computed or missing."""
-    if required_dimensions((dimension,)) != (dimension,):
-        raise OptionError(
-            "'groups' must name a dimension other than coordinates and what is made of them",
-            found=dimension,
-        )
-    no_rows = np.zeros(0, np.int64)
-    for cloud in clouds:
-        take_dimensions((dimension,), cloud.dimensions, len(cloud), no_rows, cloud.name)
 
 
 def limit_to_percentiles(values: npt.NDArray[np.float32], plan: FeaturePlan) -> None:

@@ -13,12 +13,11 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..features.point_grid import check_xyz
-from .context_features import Context
 from .input_dimensions import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS, required_dimensions
 from .interface import preprocessing, trainer_of
 from .model import Model
 from .training_clouds import TrainingCloud, prepared, spooled
-from .training_options import TrainingOptions, feature_plan
+from .training_options import TrainingOptions
 
 
 def train(
@@ -27,7 +26,6 @@ def train(
     options: TrainingOptions | None = None,
     *,
     dimensions: Mapping[str, npt.ArrayLike] | None = None,
-    folder: Path | None = None,
     progress: bool = True,
 ) -> Model:
     """Train a model: ``train(xyz, labels)``, or ``train(clouds, options)``.
@@ -37,10 +35,7 @@ def train(
     clouds : (n, 3) array, TrainingCloud, or iterable of TrainingCloud
         Coordinates in meters of points that have `labels`; or one cloud per file or view. Features
         see only their own cloud. Of anything but a list or tuple one cloud at a time is in memory;
-        all are kept in `folder` while training lasts. With tiles (:meth:`TiledCloud.clouds`, as far
-        around as :func:`reach` says) the model is that of the whole cloud, but for points whose
-        nearest neighbors lie farther away, and for thinned copies, which follow the density of each
-        tile.
+        all are kept in files while training lasts.
     labels : (n,) int, optional
         Class codes, with coordinates; the options may stand here otherwise.
     options : TrainingOptions
@@ -48,8 +43,6 @@ def train(
         With coordinates: name to (n,) values, as the options' `dimensions` need. Without, heights
         are made of the coordinates as ``filters.hag_morphological`` makes them, and the model knows
         how.
-    folder : Path, optional
-        Instead of a temporary one.
     progress : bool
         Whether to show progress on stderr.
     """
@@ -72,7 +65,7 @@ def train(
             cloud = replace(cloud, dimensions=computed)
         sources = [cloud]
     with tempfile.TemporaryDirectory(prefix="pdal-stages-") as temporary:
-        usable_clouds = _usable_clouds(sources, options, folder or Path(temporary))
+        usable_clouds = _usable_clouds(sources, options, Path(temporary))
         model = trainer_of(options.algorithm).train(usable_clouds, options, progress)
     if options.base is None:
         model.record_preprocessing(preparation)
@@ -86,7 +79,7 @@ def _usable_clouds(
     clouds: Iterable[TrainingCloud] = prepared(sources, options)
     if not isinstance(sources, list | tuple):
         clouds = spooled(clouds, folder)
-    if usable := [cloud for cloud in clouds if cloud.points]:
+    if usable := [cloud for cloud in clouds if len(cloud)]:
         return usable
     left_out = ", ".join(map(str, options.ignore))
     raise OptionError(
@@ -94,12 +87,3 @@ def _usable_clouds(
         cure=f"Give some; those of labels {left_out} are left out ('ignore') unless 'classes' "
         "names them",
     )
-
-
-def reach(options: TrainingOptions) -> float:
-    """Return the meters around a tile whose points training on the tile depends on."""
-    halo, context = feature_plan(options).halo_m, Context(tuple(options.context)).reach
-    passes = options.passes - 1
-    if options.base is not None:
-        halo, passes = max(halo, options.base.plan.halo_m), 1
-    return halo + passes * context + 2.0 * options.voxel

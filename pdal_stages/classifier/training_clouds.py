@@ -1,11 +1,9 @@
-"""Labeled clouds for training: cleaned, thinned, in tiles, kept on disk; and their classes."""
+"""Labeled clouds for training: cleaned, thinned, kept on disk; and their classes."""
 
 from __future__ import annotations
 
-import math
 import os
 import platform
-import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -46,8 +44,6 @@ class TrainingCloud:
     mask: npt.ArrayLike | None = None
     survey: str = ""  #: the survey it belongs to; by default one of its own, called as it is
     copy: str = ""  #: which of the survey's copies it is, where there are several
-    #: (n,) bool, of a tile the points inside; the others are only neighbors. None: all are inside
-    inside: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
         """Make the coordinates float64, name the survey, and count the labels."""
@@ -67,29 +63,16 @@ class TrainingCloud:
         return as_codes(self.labels, f"label of {self.name}")
 
     @property
-    def points(self) -> int:
-        """Return the number of points inside."""
-        return len(self) if self.inside is None else int(np.count_nonzero(self.inside))
-
-    @property
-    def usable(self) -> npt.NDArray[np.bool_]:
-        """Return which points (n,) samples may be drawn from."""
-        good = np.ones(len(self), np.bool_) if self.mask is None else np.array(self.mask)
-        return good if self.inside is None else good & np.asarray(self.inside)
-
-    @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return all values of the points by name; dimensions as ``d/Intensity``."""
-        values = {"xyz": self.xyz, "labels": self.labels, "mask": self.mask, "inside": self.inside}
+        values = {"xyz": self.xyz, "labels": self.labels, "mask": self.mask}
         values |= {f"d/{name}": array for name, array in self.dimensions.items()}
         return {name: np.asarray(array) for name, array in values.items() if array is not None}
 
     def with_arrays(self, arrays: Mapping[str, npt.NDArray[Any]], **more: Any) -> TrainingCloud:
         """Return a cloud of other points, with values as of :attr:`arrays`; the rest stays."""
         dimensions = {name[2:]: values for name, values in arrays.items() if name.startswith("d/")}
-        known: dict[str, Any] = {
-            name: arrays.get(name) for name in ("xyz", "labels", "mask", "inside")
-        }
+        known: dict[str, Any] = {name: arrays.get(name) for name in ("xyz", "labels", "mask")}
         return replace(self, dimensions=dimensions, **known, **more)
 
     def part(self, rows: npt.NDArray[np.int64], copy: str = "") -> TrainingCloud:
@@ -179,52 +162,6 @@ def _mapped(cloud: TrainingCloud, folder: Path, number: int) -> TrainingCloud:
     return cloud.with_arrays(kept)
 
 
-class TiledCloud:
-    """A cloud in square tiles on disk: each is trained on with the points around it at hand.
-
-    Parameters
-    ----------
-    folder : Path
-        Made for them alone.
-    side : float
-        Of the squares in meters: tile (i, j) begins at ``i * side, j * side``. Points on an
-        edge may belong to either tile.
-    """
-
-    def __init__(self, folder: Path, side: float) -> None:
-        self.folder, self.side = folder, side
-        self.tiles: dict[tuple[int, int], TrainingCloud] = {}
-        folder.mkdir()
-
-    def put(self, tile: tuple[int, int], cloud: TrainingCloud) -> None:
-        """Write a tile, unless it is empty."""
-        if len(cloud):
-            self.tiles[tile] = _mapped(cloud, self.folder, len(self.tiles))
-
-    def clouds(self, halo: float) -> Iterator[TrainingCloud]:
-        """Yield each tile with the points up to `halo` meters around it; then remove the files."""
-        steps = math.ceil(halo * (1 + 1e-6) / self.side)
-        for tile in sorted(self.tiles, key=lambda t: (t[1], t[0])):
-            low = np.array(tile) * self.side - halo
-            high = low + self.side + 2 * halo
-            parts, inside = [], []
-            for b in range(tile[1] - steps, tile[1] + steps + 1):
-                for a in range(tile[0] - steps, tile[0] + steps + 1):
-                    part = self.tiles.get((a, b))
-                    if part is None:
-                        continue
-                    is_tile = (a, b) == tile
-                    near = is_tile | ((part.xyz[:, :2] >= low) & (part.xyz[:, :2] <= high)).all(
-                        axis=1
-                    )
-                    parts.append(part.part(np.flatnonzero(near)))
-                    inside.append(np.full(len(parts[-1]), is_tile))
-            each = [part.arrays for part in parts]
-            whole = {name: np.concatenate([arrays[name] for arrays in each]) for name in each[0]}
-            yield self.tiles[tile].with_arrays({**whole, "inside": np.concatenate(inside)})
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-
 @dataclass(frozen=True, eq=False)
 class Labeled:
     """Clouds with their classes: of each the coordinates and class positions, -1 where not used."""
@@ -240,7 +177,8 @@ class Labeled:
         """Return coordinates (n, 3) and class positions (n,) of a cloud."""
         cloud = self.clouds[number]
         position = self.classes.index(cloud.codes)
-        position[~cloud.usable] = -1
+        if cloud.mask is not None:
+            position[~np.asarray(cloud.mask)] = -1
         return cloud.xyz, position
 
     def __iter__(self) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]]:
@@ -262,6 +200,8 @@ class Labeled:
         `counts` are those of each class's samples, `importances` those of each pass, `crossed` is
         the score of the cross-validation, `packages` are those whose versions are stored.
         """
+        # Empty clouds do not count.
+        positive = [each for each in (density(cloud.xyz) for cloud in self.clouds) if each]
         classes = zip(
             self.classes.codes, self.classes.names, self.classes.labels, counts, strict=True
         )
@@ -273,9 +213,15 @@ class Labeled:
                 {"code": code, "name": name, "labels": list(labels), **counted}
                 for code, name, labels, counted in classes
             ],
-            "training": {"clouds": listed(self.clouds), **training},
+            "training": {
+                "clouds": [
+                    {"name": os.path.basename(cloud.name), "points": len(cloud)}
+                    for cloud in self.clouds
+                ],
+                **training,
+            },
             **more,
-            "densities": densities(self.clouds),
+            "densities": {"low": min(positive, default=0.0), "high": max(positive, default=0.0)},
             "voxel": options.voxel,
             "accuracy": {"cross_validation": crossed},
             "passes": [{"importances": values} for values in importances],
@@ -294,7 +240,8 @@ def label_classes(
     number = np.zeros(MAX_LABEL + 1, np.int64)
     with Progress(sum(map(len, clouds)), "counting labels", enabled=progress) as bar:
         for cloud in clouds:
-            number += np.bincount(cloud.codes[cloud.usable], minlength=len(number))
+            codes = cloud.codes if cloud.mask is None else cloud.codes[np.asarray(cloud.mask)]
+            number += np.bincount(codes, minlength=len(number))
             bar.update(len(cloud))
     counts = {int(label): int(number[label]) for label in np.flatnonzero(number)}
     listing = ", ".join(f"{label}: {n:,}" for label, n in sorted(counts.items())[:20])
@@ -317,23 +264,3 @@ def label_classes(
             "names them",
         )
     return Labeled(clouds, classes)
-
-
-def listed(clouds: Iterable[TrainingCloud]) -> list[dict[str, Any]]:
-    """Return names and numbers of points of clouds, the tiles of a cloud together."""
-    rows: dict[tuple[str, int], int] = {}
-    for number, cloud in enumerate(clouds):
-        key = os.path.basename(cloud.name), number if cloud.inside is None else -1
-        rows[key] = rows.get(key, 0) + cloud.points
-    return [{"name": name, "points": points} for (name, _), points in rows.items()]
-
-
-def densities(clouds: Iterable[TrainingCloud]) -> dict[str, float]:
-    """Return the smallest and largest density of some clouds; of tiles the median counts."""
-    of_cloud: dict[object, list[float]] = {}
-    for number, cloud in enumerate(clouds):
-        key = number if cloud.inside is None else (cloud.name, cloud.survey, cloud.copy)
-        of_cloud.setdefault(key, []).append(density(cloud.xyz))
-    medians = [float(np.median(each)) for each in of_cloud.values()]
-    positive = [median for median in medians if median]  # empty clouds do not count
-    return {"low": min(positive, default=0.0), "high": max(positive, default=0.0)}

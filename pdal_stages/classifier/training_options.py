@@ -177,16 +177,9 @@ class TrainingOptions(Settings):
     folds: int = setting(
         5,  # not tuned
         "integer",
-        "Folds of cross-validation by group, survey or block of ground, with a quarter of the "
-        "trees; 0 for none",
+        "Folds of cross-validation by survey or block of ground, with a quarter of the trees; 0 "
+        "for none",
         *(0, 1000),
-    )
-    groups: str = setting(
-        "",
-        "string",
-        "Dimension, such as the number of a tile or flight, whose points of the same value are "
-        "held out together, so that "
-        "the score is for tiles or flights that the model has not seen",
     )
     passes: Any = setting(
         None,

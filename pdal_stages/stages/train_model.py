@@ -61,7 +61,6 @@ class TrainModel(Stage, settings=TrainingOptions):
         choices=tuple(RECIPES),
     )
     base: str | None
-    groups: str
     seed: int
     algorithm: str = declared_option(TrainingOptions, "algorithm", choices=tuple(kinds()))
     dimensions: list = declared_option(
@@ -181,8 +180,7 @@ class TrainModel(Stage, settings=TrainingOptions):
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
-        numbers = [self.groups] if self.groups else []
-        return [self.label, *numbers, *required_dimensions(self.training.inputs)]
+        return [self.label, *required_dimensions(self.training.inputs)]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Train on the points and write the model."""
@@ -198,7 +196,7 @@ class TrainModel(Stage, settings=TrainingOptions):
 
     def cloud_of(self, points: Points, training: TrainingOptions) -> TrainingCloud:
         """Return the points as a cloud to train on."""
-        needed = required_dimensions((*training.inputs, *filter(None, [self.groups])))
+        needed = required_dimensions(training.inputs)
         dimensions = {name: points.dimension(name) for name in needed}
         dimensions |= {
             n: points.arrays[n] for n in optional_dimensions(training.inputs) if n in points.arrays
@@ -244,12 +242,6 @@ class TrainModel(Stage, settings=TrainingOptions):
             )
         if unscored := model.info["training"].get("unscored"):
             report.warnings.append(unscored)
-        crossed = model.info["accuracy"]["cross_validation"] or {}
-        if "instead" in crossed:
-            report.notes.append(
-                f"blocks are held out, not {model_description.groups_word(self.groups)}: "
-                f"{crossed['instead']}"
-            )
         if model_description.held_out(model.info):
             report.figures["score"] = model_description.score(model.info)
             report.notes.append(report.figures["score"])

@@ -6,12 +6,9 @@ import fnmatch
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ..base import las
 from ..base.errors import OptionError, StageError
@@ -19,16 +16,14 @@ from ..base.files import check_outputs
 from ..base.memory import free_memory
 from ..base.messages import Report
 from ..classifier.model import Model
-from ..classifier.model_description import FILE_NUMBER
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
-from ..classifier.training_options import TrainingOptions
 from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import stage_files
 from ..pipeline.json_source import Override, overridden
 from ..pipeline.pdal import reader_of
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import Callbacks, points_of_views
+from ..pipeline.runtime import points_of_views
 from ..pipeline.spatial_reference import check_readers
 from ..stages.points import Points
 from ..stages.preprocessing import preparation_of
@@ -87,25 +82,9 @@ class TrainTask:
 
     @cached_property
     def _writer(self) -> dict[str, Any]:
-        """Return the training stage as in a pipeline, which scores several files by file."""
-        files = list(self.files)
-        writer = {
-            "type": TrainModel.type,
-            "filename": self.model,
-            "files": files,
-            **self.stage_options,
-        }
-        writer = overridden(writer, self.overrides)
-        grouping = {name: value for name in ("survey", "groups") if (value := writer.get(name))}
-        if grouping and self.surveys:
-            raise OptionError(
-                "surveys are given by files or by a dimension, not by both",
-                found=", ".join(f"{name}={value}" for name, value in grouping.items()),
-            )
-        forest = writer.get("algorithm", TrainingOptions.algorithm) == "random_forest"
-        if len(files) > 1 and forest and not (grouping or self.surveys):
-            writer["groups"] = FILE_NUMBER
-        return writer
+        """Return the training stage as in a pipeline."""
+        writer = {"type": TrainModel.type, "filename": self.model, "files": list(self.files)}
+        return overridden({**writer, **self.stage_options}, self.overrides)
 
     @cached_property
     def stage(self) -> TrainModel:
@@ -153,19 +132,11 @@ class TrainTask:
         return [text for text in messages if not any(text.endswith(f": {m}") for m in messages)]
 
     def _read(self, files: Sequence[str], heights: Sequence[Mapping[str, Any]]) -> Points:
-        """Read the points with heights, and with file numbers where the score groups by file."""
+        """Read the points with heights."""
         readers = [reader_of(file, f"input{i}") for i, file in enumerate(files, 1)]
         messages = check_readers(readers)
-        numbers = count(1)
-
-        def number(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
-            """Set the number of a file; PDAL calls it for one reader after the other."""
-            outs[FILE_NUMBER] = np.full(len(ins["X"]), next(numbers), np.uint32)
-
-        callbacks = Callbacks()
-        grouped = self.stage.groups == FILE_NUMBER
-        numbered = [callbacks.filter(number, {FILE_NUMBER: "uint32_t"})] if grouped else []
-        pipeline = Pipeline([*readers, *numbered, *map(dict, heights)], self._other_overrides)
+        stages = [*map(dict, heights)] or [{"type": "filters.merge"}]  # one end of all readers
+        pipeline = Pipeline([*readers, *stages], self._other_overrides)
         pipeline.execute()
         if not any(map(len, pipeline.arrays)):
             raise StageError("there are no points to train on", where=", ".join(files[:3]))
