@@ -16,6 +16,9 @@ from typing import Any
 from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
 
+#: A pipeline of so many bytes is another file, or a device.
+_MOST_BYTES = 1 << 26
+
 
 @dataclass
 class PipelineSource:
@@ -48,7 +51,10 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     if text.lstrip("\ufeff \t\r\n")[:2].startswith(("[", "{", "//", "/*")):
         return parse_pipeline(text)
     try:
-        data = Path(source).read_bytes()
+        with open(source, "rb") as file:
+            data = file.read(_MOST_BYTES)
+        if len(data) == _MOST_BYTES:  # /dev/zero has no end
+            raise OSError(f"{_MOST_BYTES >> 20} MB or more, too much for a pipeline")
     except (OSError, ValueError) as error:
         where = ascii(text[:200])[1:-1]
         raise PipelineError("the pipeline file cannot be read", where=where, found=error) from None
