@@ -44,7 +44,7 @@ COLUMNS = (
 EXTRAS = (
     ("objects/", "outlines of buildings, trees", "filters.objects, objects"),
     ("review/", "what a person checks, corrects", "review, corrections"),
-    ("reports/", "pages, pictures, vector files", "--html, --report"),
+    ("reports/", "pages, pictures, vector files", "--html"),
     ("synthetic/", "a generated town", "demo"),
     ("qgis/", "the plugin for QGIS", "calls the command"),
 )

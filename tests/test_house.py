@@ -17,7 +17,7 @@ FLOORS = (
 EXTRAS = {"objects", "review", "reports", "synthetic"}
 DOORS = {
     "stages/accuracy.py", "stages/group_objects.py", "stages/write_objects.py",
-    "tiling/objects_from_files.py", "cli/tiled_runs.py", "cli/extras.py", "cli/installation.py",
+    "tiling/objects_from_files.py", "cli/extras.py", "cli/installation.py",
 }  # fmt: skip
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
 

@@ -366,10 +366,10 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
 def test_many_files_and_training(algorithm, ready_halves, ready_town, tmp_path):
     out, model = tmp_path / "out", tmp_path / "m.model"
     output = algorithm(
-        "classifysurvey", FOLDER=ready_halves, OUTPUT=out, REPORT=tmp_path / "r.html", WORKERS=0
+        "classifysurvey", FOLDER=ready_halves, OUTPUT=out, REPORT=tmp_path / "r.json", WORKERS=0
     )
     assert sorted(path.name for path in out.glob("*.laz")) == ["east.laz", "west.laz"], output
-    assert (tmp_path / "r.html").is_file()
+    assert (tmp_path / "r.json").is_file()
     few = {"COUNT": 50, "TREES": 5, "NEIGHBORHOODS": "k10"}
     output = algorithm("train", INPUTS=ready_town, MODEL=model, **few)
     assert output.count("blocks held out") == 1

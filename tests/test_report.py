@@ -16,7 +16,6 @@ from PIL import Image
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.accuracy.text import percent
 from pdal_stages.reports.accuracy_page import Place, write_accuracy_report
-from pdal_stages.reports.page import run_page
 
 VOID = {"meta", "img", "br"}
 
@@ -215,76 +214,3 @@ def test_degenerate_clouds(xyz, maps):
     page = Page(accuracy_page(a, places=[Place("", xyz, reference, predicted)]))
     assert len([i for i in page.all("img") if i["alt"].startswith("Map")]) == maps
     assert ("No map: " in page.text) == (maps == 0)
-
-
-# ---- the page of a tiled run -----------------------------------------------------------------------------
-
-
-def tiled(**changes):
-    """What a run after --resume reports: one tile done, one kept, one failed."""
-    nasty = "<x>\"'&"
-    done = {"points": 2000, "read": 2500, "halo_m": 12.3456789, "seconds": 81.23456, "tries": 1}
-    return {
-        "pipeline": f"/jobs/{nasty}.json",
-        "models": [f"{nasty}.model"],
-        "started": "2024-05-06 07:08",
-        "inputs": 2,
-        "tile": 500.0,
-        "bounds": [770500.004999, 6277000.0, 772000.0, 6277500.0],
-        "halo_m": 12.3456789012,
-        "workers": 2,
-        "cpu_seconds": 3723.4567891,
-        "points": 2000,
-        "seconds": 90.123456,
-        "points_per_second": 22.191717,
-        "peak_mb_of_a_worker": 512.3456,
-        "dropped": 0,
-        "states": {"done": 1, "kept": 1, "failed": 1},
-        "classes": {"2": 4000, "6": 1000},
-        "messages": [nasty],
-        "failures": [{"what": nasty, "reason": nasty}],
-        "tiles": [
-            {"name": "770500_6277000", "tile": [1541, 12554], "state": "done", **done},
-            {
-                "name": "771000_6277000",
-                "tile": [1542, 12554],
-                "state": "kept",
-                "points": 3000,
-                "tries": 0,
-            },
-            {
-                "name": nasty,
-                "tile": [1543, 12554],
-                "state": "failed",
-                "points": 5,
-                "tries": 3,
-                "reason": nasty,
-            },
-        ],
-        "outputs": [{"input": nasty, "output": [nasty], "state": "kept", "written": 3000}],
-        **changes,
-    }
-
-
-def test_a_run_tells_what_it_did_and_what_it_kept():
-    page = Page(run_page(tiled()))
-    assert page.text.count("<x>\"'&") >= 7  # nothing becomes markup
-    assert "x" not in {tag for tag, _ in page.tags}
-    for words in (
-        "1 kept from an earlier run, 1 failed",
-        "3,000 more kept from an earlier run",
-        "2024-05-06 07:08",
-        "x 770500.00 to 772000.00, y 6277000.00 to 6277500.00",
-        "12.3457",
-        "62 min",
-        "90 s",
-    ):
-        assert words in page.text
-    assert not re.search(r"\d\.\d{5,}", page.text)
-
-
-def test_a_run_of_nothing_makes_a_page():
-    empty = tiled(
-        tiles=[], outputs=[], failures=[], notes=[], classes={}, states={"waiting": 0}, bounds=None
-    )
-    assert "Failures" not in Page(run_page(empty)).text

@@ -384,7 +384,7 @@ def test_stopped_while_workers_start(tmp_path, folder):
 
 
 def test_a_name_that_is_not_utf8(tmp_path, folder, capsys):
-    """It is told, and both reports are written."""
+    """It is told, and the report is written."""
     try:
         shutil.copy(folder / "west.laz", tmp_path / os.fsdecode(b"w\xe4st.laz"))
     except OSError:
@@ -393,11 +393,11 @@ def test_a_name_that_is_not_utf8(tmp_path, folder, capsys):
     from pdal_stages.cli import main
 
     (tmp_path / "job.json").write_text(json.dumps(pipeline(tmp_path, tmp_path / "o_#.laz")))
-    reports = [str(tmp_path / name) for name in ("r.html", "r.json")]
-    words = ["--tile", "40", "--workers", "0", "--report", reports[0], "--report", reports[1]]
+    report = tmp_path / "r.json"
+    words = ["--tile", "40", "--workers", "0", "--report", str(report)]
     assert main(["pipeline", str(tmp_path / "job.json"), *words]) == 1
     assert "the name of the file is not UTF-8" in capsys.readouterr().err
-    assert all("w\\udce4st" in Path(name).read_text() for name in reports)
+    assert "w\\udce4st" in report.read_text()
 
 
 # ---- what a run keeps -------------------------------------------------------------------------------------

@@ -9,12 +9,11 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..base.asprs import class_name
 from ..base.errors import OptionError
-from ..base.files import HTML, JSON, Output, write_json, write_whole
+from ..base.files import JSON, Output, write_json
 from ..base.memory import parse_size
 from ..base.messages import count_of, print_messages
 from ..stages.registry import describe_count
@@ -23,8 +22,6 @@ from ..tiling.options import PER, TilingOptions
 if TYPE_CHECKING:
     from ..tiling.jobs import Job, TiledRun
 
-#: Kinds of reports by the suffix of the file.
-_REPORTS = {".html": HTML, ".htm": HTML, ".json": JSON}
 #: Failures that are printed, a screenful; reports hold all of them.
 _MOST_FAILURES = 20
 #: Tiles of a dry run that are printed.
@@ -32,14 +29,9 @@ _MOST_TILES = 50
 
 
 def run_files(options: argparse.Namespace) -> list[Output]:
-    """Return the files about a run that flags name; OptionError for reports of other kinds."""
-    files = [Output(options.metadata, "metadata", JSON)] if options.metadata else []
-    for name in options.report:
-        kind = _REPORTS.get(Path(name).suffix.lower())
-        if kind is None:
-            raise OptionError("--report writes .html or .json", found=name)
-        files.append(Output(name, "report", kind))
-    return files
+    """Return the files about a run that flags name."""
+    named = {"metadata": options.metadata, "report": options.report}
+    return [Output(name, what, JSON) for what, name in named.items() if name]
 
 
 def add_tile_options(command: argparse.ArgumentParser, survey: bool = False) -> None:
@@ -58,8 +50,7 @@ def add_tile_options(command: argparse.ArgumentParser, survey: bool = False) -> 
     add("--buffer", type=float, metavar="METERS", help=buffer)
     add("--resume", action="store_true", help="Continue a run that was stopped or failed")
     add("--dry-run", action="store_true", help="Show tiles, memory and disk needed, then stop")
-    report = "Write a report, .html or .json"
-    add("--report", action="append", default=[], metavar="FILE", help=report)
+    add("--report", metavar="FILE", help="Write counts of outputs, tiles, classes to a JSON file")
 
 
 def _tile_side(text: str) -> float | str:
@@ -225,11 +216,7 @@ def end_run(files: Sequence[Output], run: TiledRun, again: str) -> int:
     """
     content = run.to_dict()
     for file in files:
-        if file.kind == HTML:
-            from ..reports.page import run_page
-
-            write_whole(file.path, run_page(content).encode(), file.what)
-        elif file.what == "metadata" and run.metadata is not None:
+        if file.what == "metadata" and run.metadata is not None:
             write_json(file.path, run.metadata, file.what)
         else:
             write_json(file.path, content, file.what)

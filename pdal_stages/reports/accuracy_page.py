@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..accuracy.measures import Accuracy
+from ..accuracy.text import percent
 from ..base.asprs import class_color
 from ..base.files import write_whole
-from .page import render
+from ..base.messages import plain
+from ..base.version import __version__
 from .pictures import IGNORED, RIGHT, WRONG, embed, error_colors, nice_step, paint, shading, surface
 
 # Values without a reason are not tuned.
@@ -80,8 +85,7 @@ def write_accuracy_report(
     names = [place.name if len(places) > 1 else "" for place in places[:MAX_PLACES]]
     maps = [_maps(accuracy, place) for place in places[:MAX_PLACES]]
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
-    page = render(
-        "accuracy.html",
+    page = _render(
         title=title,
         subtitle=subtitle,
         a=accuracy,
@@ -139,3 +143,52 @@ def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
         ],
         "in_a_row": columns < MAX_IN_A_ROW * rows,
     }
+
+
+def _render(**context: Any) -> str:
+    """Return the page, self-contained and without scripts; all values are escaped."""
+    context = {"version": __version__, "date": _today(), **context}
+    page = _templates().get_template("accuracy.html").render(context)
+    # Names of files may hold bytes that are not UTF-8, or control characters.
+    return plain(page.encode(errors="backslashreplace").decode())
+
+
+@lru_cache(maxsize=1)
+def _templates() -> Environment:
+    environment = Environment(
+        loader=PackageLoader(__package__),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(percent=percent, count=lambda n: f"{n:,}", flat=flat)
+    environment.globals.update(class_color=class_color)
+    return environment
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Return names and values as text: nested mappings get dotted names, numbers six digits."""
+    out: list[tuple[str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            out += flat(value, f"{prefix}{key}.")
+        else:
+            out.append((f"{prefix}{key}", _text(value)))
+    return out
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping | list | tuple | set | frozenset):
+        return ", ".join(map(_text, value)) or "none"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.6g}"
+    return "none" if value is None else str(value)
+
+
+def _today() -> str:
+    """Return the date, or the day that the environment sets with ``SOURCE_DATE_EPOCH``."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    if epoch.isdigit():
+        return datetime.datetime.fromtimestamp(int(epoch), datetime.timezone.utc).date().isoformat()
+    return datetime.date.today().isoformat()

@@ -26,6 +26,7 @@ _CORRECTED = (
 )
 _MODELS = "Model files (*.model);;All files (*)"
 _PAGES = "Pages (*.html)"
+_REPORTS = "Reports (*.json)"
 _SHOW = "Show the result on the map"
 _NO_CLOUDS = (
     "This QGIS is built without support for LAS and LAZ files, so the point cloud is not shown: {}"
@@ -169,7 +170,7 @@ class ClassifySurvey(_Classifying):
         )
         self.addParameter(parameter)
         self.add_destination(
-            "REPORT", "Report", self.help_of("report"), _PAGES, optional=True, createByDefault=False
+            "REPORT", "Report", self.help_of("report"), _REPORTS, optional=True, createByDefault=False
         )
         self.addParameter(QgsProcessingParameterBoolean("SHOW", _SHOW, defaultValue=False))
 

@@ -85,5 +85,5 @@ def test_files_that_are_written(tmp_path, cloud, model):
         {"type": "filters.modelclassifier", "model": str(model)},
         "o_#.las",
     )
-    words = ["pipeline", path, "--tile", "15", "--workers", "2", "--report", "r.html"]
-    assert written(tmp_path, *words) == {"o_raw.las", "r.html"}
+    words = ["pipeline", path, "--tile", "15", "--workers", "2", "--report", "r.json"]
+    assert written(tmp_path, *words) == {"o_raw.las", "r.json"}
