@@ -160,6 +160,9 @@ def _check_values(stage: Any, where: str) -> None:
         text.encode()
         if "\\u0000" in text.replace("\\\\", ""):  # a backslash before it makes it a text
             raise ValueError("a text holds a NUL character")
+    except UnicodeEncodeError as error:
+        what, cure = "a text is not valid UTF-8", "If it is a file's name, rename the file"
+        raise PipelineError(what, where=where, found=error, cure=cure) from None
     except (TypeError, ValueError, RecursionError) as error:
         what = "a stage holds a value that PDAL cannot take"
         raise PipelineError(what, where=where, found=error) from None
