@@ -19,6 +19,9 @@ from ..base.errors import OptionError, PipelineError, suggest
 #: A pipeline of so many bytes is another file, or a device.
 _MOST_BYTES = 1 << 26
 
+#: No pipeline file has as many bytes; devices have no end.
+_MOST_BYTES = 1 << 26
+
 
 @dataclass
 class PipelineSource:
