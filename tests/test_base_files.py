@@ -163,53 +163,6 @@ def test_what_is_refused_stays_what_it_is(tmp_path, monkeypatch):
             write_whole("/dev/full", b"x" * 100)
 
 
-@unix
-def test_a_pipe_is_written_into(tmp_path):
-    pipe, content = tmp_path / "pipe", os.urandom(300_000)
-    os.mkfifo(pipe)
-    read = []
-    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()))
-    reader.start()
-    write_whole(pipe, content)
-    reader.join()
-    assert read == [content] and stat.S_ISFIFO(pipe.stat().st_mode) and names(tmp_path) == ["pipe"]
-
-
-@unix
-@pytest.mark.parametrize("into", ["pipe", "file"])
-def test_devices_stay_what_they_are(tmp_path, into):
-    devices = ["/dev/null", "/dev/stdout", "/dev/stderr", "/dev/fd/1", "/proc/self/fd/1"]
-    program = (
-        "import sys; from pdal_stages.base.files import check_writable, write_whole\n"
-        f"for name in {devices}:\n"
-        "    print('before'); check_writable(name); write_whole(name, f'{name}\\n'.encode())\nprint('after')"
-    )
-    before = [os.lstat(name) for name in devices[:-1]]
-    seen = tmp_path / "seen"
-    with open(seen, "w") as out:
-        out.write("older\n")
-        out.flush()
-        target = out if into == "file" else subprocess.PIPE
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            stdout=target,
-            stderr=subprocess.STDOUT,
-            text=True,
-            check=True,
-        )
-    for old, new in zip(before, map(os.lstat, devices[:-1]), strict=True):
-        assert (old.st_ino, old.st_mode, old.st_rdev) == (new.st_ino, new.st_mode, new.st_rdev)
-    lines = (seen.read_text().removeprefix("older\n") if into == "file" else done.stdout).split()
-    # Standard output has all in its order; what goes to standard error passes lines that wait to be written.
-    expected = ["before", "before", "/dev/stdout", "before", "before", "/dev/fd/1", "before"]
-    assert [line for line in lines if line != "/dev/stderr"] == [
-        *expected,
-        "/proc/self/fd/1",
-        "after",
-    ]
-    assert "/dev/stderr" in lines and names(tmp_path) == ["seen"]
-
-
 KILLED = """
 import os, signal, sys
 from pdal_stages.base.files import whole_files

@@ -14,8 +14,6 @@ def test_figures_that_mean_nothing():
     for side in (1e-300, 1e-6, -1.0, 6.0):
         with pytest.raises(OptionError, match="voxel"):
             ps.TrainingOptions(voxel=side)
-        with pytest.raises(StageError, match="voxel"):
-            ps.Filter.multiscalefeatures(voxel=side)
     for side in (0, 0.001, 5.0):
         assert ps.TrainingOptions(voxel=side).voxel == side
     for memory in (0, -5, float("nan")):

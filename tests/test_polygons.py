@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import laspy
@@ -66,7 +64,7 @@ def test_what_is_written_for_a_file_and_a_class():
         "b.gpkg", "deck 1", 17, (2, 6)
     )
     assert Overlay.parse("C:\\maps\\r.shp=11:all") == Overlay("C:\\maps\\r.shp", "", 11, ())
-    for text in (
+    for text in [
         "lakes.gpkg",
         "=9",
         "l.gpkg=",
@@ -75,7 +73,7 @@ def test_what_is_written_for_a_file_and_a_class():
         "l.gpkg=9:",
         "l.gpkg=9:x",
         "l=-1",
-    ):
+    ]:
         with pytest.raises(OptionError, match="polygons are written FILE=CODE"):
             Overlay.parse(text)
 
@@ -199,24 +197,6 @@ def test_in_tiles_as_in_one_piece(tmp_path, write_las, run_job):
     assert np.array_equal(*results) and (results[0] == 9).sum() > 300
     with pytest.raises(StageError):
         ps.Pipeline([str(source), lay, {"type": "writers.las", "filename": path}]).execute()
-
-
-@pytest.mark.pdal
-def test_water_of_delft_on_the_command_line(tmp_path, data_dir):
-    shapes = shapely.from_wkb(pyogrio.raw.read(str(data_dir / "delft/water_train.geojson"))[2])
-    water = write(tmp_path / "water.gpkg", shapes, 4258)
-    las = laspy.read(data_dir / "delft/train.laz")
-    las.points = las.points[(np.abs(las.x - 84825) < 25) & (np.abs(las.y - 447545) < 25)]
-    las.header.add_crs(pyproj.CRS(RD))
-    las.write(tmp_path / "in.laz")
-    out = tmp_path / "out.laz"
-    words = ["classify", str(tmp_path / "in.laz"), str(out), "--polygons", f"{water}=9"]
-    program = [sys.executable, "-m", "pdal_stages.cli"]  # which does without pyproj where it can
-    output = subprocess.check_output([*program, *words], text=True)
-    codes = np.asarray(laspy.read(out).classification)
-    assert (codes == 9).any() and "  9 Water" in output
-    at = inside({"X": las.x, "Y": las.y}, *shapes)
-    assert not (codes[~at] == 9).any() and not (codes[at] == 2).any()
 
 
 def test_damaged_files_are_errors_of_ours(tmp_path):

@@ -117,11 +117,6 @@ def test_every_door_reads_them_under_another_name(command, tmp_path, write_las, 
         assert np.array_equal(out.classification, right.classification)
         assert np.array_equal(out.gps_time, right.gps_time)
         assert np.array_equal(out[f"Extra_{title}"], values)
-    per_tile = ["--per", "tile", *TILES]
-    command.runs(["classify", source, f"{tmp_path}/each/", "--model", model, *per_tile])
-    parts = [laspy.read(path) for path in sorted((tmp_path / "each").glob("*.laz"))]
-    merged = np.concatenate([np.asarray(part[f"Extra_{title}"]) for part in parts])
-    assert np.array_equal(np.sort(merged), values)
 
 
 # ---- arrays, type 0, bytes without a description, odd names -----------------------------------------------
@@ -177,15 +172,6 @@ def test_nothing_is_dropped(command, tmp_path, write_las, model, version, point_
         outputs.append(out)
     is_same(outputs[0], outputs[1])
     is_same(outputs[2], outputs[3])
-    # again, from what was written, and resumed
-    again = classified(command, tmp_path / f"tiles{suffix}", tmp_path / "again.las", model, *TILES)
-    is_same(again, outputs[0])
-    (tmp_path / "again.las").unlink()
-    resumed = ["--resume", *TILES]
-    is_same(
-        classified(command, tmp_path / f"tiles{suffix}", tmp_path / "again.las", model, *resumed),
-        outputs[0],
-    )
 
 
 @pytest.mark.parametrize(
@@ -213,9 +199,8 @@ def test_several_files_by_a_pattern(command, tmp_path, write_las):
     assert np.array_equal(np.unique(values, axis=0), [[0, 2], [1, 0]])
 
 
-def test_a_survey_and_its_corrections(command, tmp_path, write_las, model):
-    """Files with odd extra bytes and without, an output for each file and for each tile; then what
-    a person edits."""
+def test_a_survey(command, tmp_path, write_las, model):
+    """Files with odd extra bytes and without, an output for each file and for each tile."""
     (tmp_path / "in").mkdir()
     right = odd(tmp_path / "in" / "a.laz", write_las)
     write_las(tmp_path / "in" / "b.laz", scene(seed=2) | {"Mine": np.ones(600)}, point_format=6)
@@ -231,20 +216,6 @@ def test_a_survey_and_its_corrections(command, tmp_path, write_las, model):
         merged = np.concatenate([np.asarray(part[name], float) for part in parts])
         expected = np.append(np.asarray(right[name], float), np.zeros(600))
         assert np.allclose(np.sort(merged), np.sort(expected)), name
-    edited = laspy.read(per_file / "a.laz")
-    edited.classification[:20] = 5
-    edited.write(tmp_path / "edited.laz")
-    words = [
-        "corrections",
-        "--out",
-        tmp_path / "kept.laz",
-        per_file / "a.laz",
-        tmp_path / "edited.laz",
-    ]
-    command.runs(words)
-    assert set(extra_names) <= set(
-        laspy.read(tmp_path / "kept.laz").point_format.extra_dimension_names
-    )
 
 
 def test_two_of_one_name(command, tmp_path, write_las, model):
