@@ -103,7 +103,7 @@ def test_it_works_at_all_doors_and_in_tiles(run, cloud, tmp_path, pdal_program):
     run(*command, "pipeline", "job.json", *words)
     assert classes(tmp_path / "tiled.laz") == BANDS * 40
     report = json.loads((tmp_path / "run.json").read_text())
-    assert report["left_alone"] == {"filters.heightband.changed": 3 * 40}
+    assert report["point_counts"] == {"filters.heightband.changed": 3 * 40}
     (tmp_path / "plain.json").write_text(
         run(*command, "expand", "job.json").replace("out.laz", "stock.laz")
     )

@@ -166,7 +166,7 @@ def test_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path):
     assert classify(tmp_path / "t0.txt", tmp_path / "o.txt")[0] == 0
 
 
-def test_tiles_say_what_was_left_alone_as_one_piece_does(folder, classify, tmp_path, write_las):
+def test_tiles_say_what_has_no_class_as_one_piece_does(folder, classify, tmp_path, write_las):
     """Points without a class from the model, or with one mended: each once, although tiles overlap."""
     las = laspy.read(folder / "in" / "t0.laz")
     codes = np.array(las.classification)

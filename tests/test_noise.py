@@ -513,4 +513,4 @@ def test_counts_are_those_of_all_views(tmp_path, write_las):
     codes = np.concatenate([view["Classification"] for view in pipeline.arrays])
     expected = {"low": np.count_nonzero(codes == 7), "high": np.count_nonzero(codes == 18)}
     named = {f"filters.detachednoise.{name}": n for name, n in expected.items() if n}
-    assert len(named) == 2 and pipeline.left_alone == named
+    assert len(named) == 2 and pipeline.point_counts == named

@@ -52,7 +52,7 @@ def test_it_is_found_before_the_first_tile(
 
 
 @pytest.mark.parametrize("door", ["validate", "tiles"])
-def test_outputs_are_left_alone(tmp_path, write_las, door):
+def test_outputs_stay_as_they_are(tmp_path, write_las, door):
     """PDAL's text writer empties its file as soon as it is prepared."""
     x, y, z = np.random.default_rng(0).uniform(0, 30, (3, 300))
     cloud = write_las(tmp_path / "a.las", {"X": x, "Y": y, "Z": z})

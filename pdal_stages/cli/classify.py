@@ -109,7 +109,7 @@ def _classify(options: argparse.Namespace) -> int:
         )
         print_plan(run) if options.dry_run else print_run(run)
     if not options.dry_run:
-        print_classes(run.summary["classes"], run.summary["left_alone"], names)
+        print_classes(run.summary["classes"], run.summary["point_counts"], names)
     return end_run(files, run, "the same command with --resume" if interrupted else "")
 
 

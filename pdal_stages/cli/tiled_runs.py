@@ -123,16 +123,16 @@ def end_at_ctrl_c(is_program: bool) -> None:
 
 
 def print_classes(
-    classes: Mapping[str, int], left_alone: Mapping[str, int], names: Mapping[int, str]
+    classes: Mapping[str, int], point_counts: Mapping[str, int], names: Mapping[int, str]
 ) -> None:
     """Print the points of each class in all files together, and those without a class.
 
-    `classes` are numbers of points by code, `left_alone` by the name of the count; `names` are the
-    model's by code.
+    `classes` are numbers of points by code, `point_counts` by the name of the count; `names` are
+    the model's by code.
     """
     for code, points in sorted((int(code), points) for code, points in classes.items()):
         print(f"  {code:3d} {names.get(code, class_name(code)):28s} {points:>12,}")
-    for name, points in sorted(left_alone.items()):
+    for name, points in sorted(point_counts.items()):
         print(f"  {describe_count(name):32s} {points:>12,}")
 
 

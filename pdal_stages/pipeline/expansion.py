@@ -23,7 +23,12 @@ from ..stages.registry import PDAL_OWN, stage_from, stage_type, stage_types
 from . import pdal as pdal_env
 from .inputs_outputs import is_reader, readers_files
 from .json_source import PipelineSource
-from .las_files import check_copc_outputs, check_writers, files_with_flags_to_split, flag_splitter
+from .las_files import (
+    check_copc_outputs,
+    check_las_limits,
+    files_with_flags_to_split,
+    flag_splitter,
+)
 from .runtime import BY_LABEL, TRAMPOLINE, ExpandedStage, python_filter
 from .spatial_reference import fault_of_reference
 
@@ -86,7 +91,7 @@ def expand(
         out.stages.append(expanded.plain)
     if not ready:
         _place_upstream(out)
-    check_writers(out.stages, out.ours)
+    check_las_limits(out.stages, out.ours)
     return out
 
 

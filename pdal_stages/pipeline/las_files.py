@@ -103,7 +103,7 @@ def finish(output: Path, sources: Iterable[str], unit: float | None = None) -> N
 # ---- limits, checked before any work -------------------------------------------------------------
 
 
-def check_writers(stages: list[dict[str, Any]], ours: Collection[ExpandedStage]) -> None:
+def check_las_limits(stages: list[dict[str, Any]], ours: Collection[ExpandedStage]) -> None:
     """Refuse class codes and numbers of extra dimensions that a later LAS writer cannot hold.
 
     Codes that only a run shows are refused then: the last stage that changes classes gets the limit

@@ -89,7 +89,7 @@ class Pipeline:
         return [(ours.stage.place, ours.reports) for ours in self.expanded.ours]
 
     @property
-    def left_alone(self) -> dict[str, int]:
+    def point_counts(self) -> dict[str, int]:
         """Counts of points of the last run (:attr:`Stage.counts`) above 0, by ``type.name``.
 
         They are sums over views, and over stages of one type.

@@ -233,6 +233,10 @@ class Stage(ABC):
         """Return how far around a tile points change its results, in meters."""
         return 0.0
 
+    def blocks(self) -> Blocks | None:
+        """Return the blocks that a :class:`FarReaching` stage needs before the tiles, if any."""
+        return None
+
     def written_classes(self) -> set[int]:
         """Return the class codes that the stage may write to `Classification`."""
         return set()
@@ -373,10 +377,6 @@ class FarReaching(Stage):
     """
 
     @abstractmethod
-    def blocks(self) -> Blocks | None:
-        """Return the blocks that the stage needs; None where it looks no farther than its halo."""
-
-    @abstractmethod
     def reduce_points(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """Return what blocks need of points.
 
@@ -400,8 +400,3 @@ class FarReaching(Stage):
     @abstractmethod
     def join_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
         """Join these arrays of the blocks that a box touches to :attr:`StageContext.blocks`."""
-
-
-def first_round_of(stage: Stage | None) -> Blocks | None:
-    """Return the blocks that a stage needs before the tiles; None where it does without."""
-    return stage.blocks() if isinstance(stage, FarReaching) else None

@@ -124,7 +124,7 @@ class ClassifyTask:
             "cpu_seconds": time.process_time() - cpu_seconds,
             "states": {},
             "classes": output.record["classes"],
-            "left_alone": pipeline.left_alone,
+            "point_counts": pipeline.point_counts,
         }
         return TiledRun([], [output], {}, [], messages, summary, metadata=pipeline.metadata)
 
@@ -150,9 +150,7 @@ class ClassifyTask:
             raise OptionError(
                 "runs in tiles write plain LAS or LAZ",
                 found=target,
-                cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz. "
-                "Tiles are for "
-                "several inputs, clouds too large for the memory, --tile, --per and --resume",
+                cure="Name them .laz and convert them afterwards, pdal translate o.laz o.copc.laz",
             )
         alike = one_format(self.files) if self._per_tile else {}
         writer = {**writer_of(named), "filename": target, **alike}

@@ -112,11 +112,9 @@ def perform_for(wanted: tuple[str, str], folder: str, host: str, task: bytes) ->
             f"{versions[0]} and PDAL {versions[1]} on {here}, here {wanted[0]} and {wanted[1]}). "
             "Install the same on all hosts"
         )
-    for _ in range(5):  # network file systems may show a new folder late
-        if os.path.isdir(folder):
-            break
-        time.sleep(1)
-    else:
+    if not os.path.isdir(folder):  # network file systems may show a new one late
+        time.sleep(5)
+    if not os.path.isdir(folder):
         return (
             f"a worker of the scheduler does not see the output folder (found no {folder} on "
             f"{here}). Inputs, model and outputs must have the same paths on all hosts"

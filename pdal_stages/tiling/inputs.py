@@ -209,12 +209,6 @@ class Survey:
                 source.fault = str(error)
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
         self.messages += [f"{message}{more}" for message in odd[:1]]
-        if lost := sum(source.extent is None for source in self.sources):
-            self.messages.append(
-                f"{lost:,} of the inputs have no readable header: where they lie is not known, and "
-                "tiles beside them may lack neighbors. Once they can be read, --resume runs those "
-                "tiles again"
-            )
 
     def _unit(self, plan: TilePlan, per: str) -> float:
         """Return meters per unit of the coordinates.

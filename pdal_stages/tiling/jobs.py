@@ -31,7 +31,10 @@ if TYPE_CHECKING:
 
 #: Most distinct warnings of tiles that a run repeats (not tuned).
 _MOST_MESSAGES = 20
-_BLOCKS = " (tiles and outputs that need it are not made. Without it among the inputs they are)"
+_BLOCKS = (
+    " (tiles and outputs that need it are not made; where its header cannot be read, tiles beside "
+    "it may lack neighbors)"
+)
 _CHANGED = (
     "it changed during the run, so outputs may hold results from before and after. Once it no "
     "longer changes, run it again with --resume"
@@ -139,11 +142,11 @@ def summarize(
     """Return the figures of all tiles and squares of rounds, for :attr:`TiledRun.summary`."""
     worked = [job.record for job in tiles if job.state == "done"]
     classes: Counter[str] = Counter()
-    left_alone: Counter[str] = Counter()
+    point_counts: Counter[str] = Counter()
     for job in tiles:
         classes.update(job.record.get("classes") or {})
     for job in [*tiles, *squares]:
-        left_alone.update(job.record.get("left_alone") or {})
+        point_counts.update(job.record.get("point_counts") or {})
     points, read, dropped = (
         sum(record.get(key, 0) for record in worked) for key in ("points", "read", "dropped")
     )
@@ -156,7 +159,7 @@ def summarize(
         "cpu_seconds": cpu_seconds,
         "states": {s: sum(job.state == s for job in tiles) for s in ("done", "kept", "failed")},
         "classes": dict(sorted(classes.items(), key=lambda item: int(item[0]))),
-        "left_alone": dict(left_alone),
+        "point_counts": dict(point_counts),
     }
 
 

@@ -87,18 +87,13 @@ def _find_in_files(
     wkt = references[inputs[0]].wkt
     cells = _all_cells(inputs, stage, wkt, workers)
     if sparse := cells.sparse_kind():
-        size = cells.size
-        message = f"cells of {size:g} m hold {sparse[1]:.1f} points of {sparse[0]} on average, so "
-        if "cell" in stage.set_options:
-            message += f"objects may fall apart: try --cell {2 * size:g}"
-        else:
-            while cells.sparse_kind() and cells.size < LARGEST_CELL:
-                cells = cells.doubled()
-            message += (
-                f"cells of {cells.size:g} m are used, where roofs look rougher; --cell {size:g} "
-                "keeps smaller ones"
-            )
-        print_messages(message)
+        size, is_set = cells.size, "cell" in stage.set_options
+        while not is_set and cells.sparse_kind() and cells.size < LARGEST_CELL:
+            cells = cells.doubled()
+        print_messages(
+            f"cells of {size:g} m hold {sparse[1]:.1f} points of {sparse[0]} on average, where "
+            f"objects fall apart: cells of {cells.size:g} m are used, others with --cell"
+        )
     objects = find_objects(cells, replace(stage.settings, cell=cells.size))
     return objects, references[inputs[0]].units, wkt
 

@@ -16,7 +16,7 @@ from ..pipeline.inputs_outputs import named_files, named_outputs, outputs_of, wr
 from ..pipeline.json_source import Override
 from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import MOVING
-from ..stages.base import Blocks, Stage, first_round_of
+from ..stages.base import Blocks, Stage
 from .options import Box, TileGrid
 
 #: Dimension that follows a point through a tile's pipeline: its row in the piece of its input.
@@ -254,9 +254,8 @@ def _rounds(head: list[_Step], reaches: list[float]) -> list[Round]:
     rounds: list[Round] = []
     begin, open_ended = 0, False
     for at, step in enumerate(head):
-        blocks = first_round_of(step.ours)
-        if open_ended or any(part.blocks for part in rounds):
-            blocks = None
+        only = not open_ended and not any(part.blocks for part in rounds)
+        blocks = step.ours.blocks() if step.ours is not None and only else None
         kept = _kept(head[:at])
         if blocks is not None or (kept is not None and at > begin and reaches[at] > _FAR_M):
             rounds.append(_round(head, reaches, begin, at, kept=kept or [], blocks=blocks))
@@ -359,14 +358,11 @@ def _for_workers(step: _Step) -> dict[str, Any]:
 
     A shipped model keeps its name, as its path differs between hosts.
     """
-    stage, ours = dict(step.options), step.ours
-    if ours is not None:
-        for option in ours.all_options():
-            name = stage.get(option.name)
-            if name and (
-                option.kind == "filename" or (option.kind == "model" and name not in shipped())
-            ):
-                stage[option.name] = str(Path(stage[option.name]).absolute())
+    stage = dict(step.options)
+    for option in step.ours.all_options() if step.ours is not None else ():
+        name = stage.get(option.name)
+        if name and option.kind in ("filename", "model") and name not in shipped():
+            stage[option.name] = os.path.abspath(name)
     return stage
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.grid import places_among
-from ..pipeline.las_files import check_writers
+from ..pipeline.las_files import check_las_limits
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
@@ -175,7 +175,7 @@ class HeadResult(NamedTuple):
     results: list[PieceResults]
     halo_needed_m: float = 0.0
     messages: Sequence[str] = ()  #: warnings and notes
-    left_alone: Mapping[str, int] = {}  #: counts of its own points, by ``type.name``
+    point_counts: Mapping[str, int] = {}  #: counts of its own points, by ``type.name``
     reduced: Sequence[dict[str, NDArray]] = ()  #: what blocks need of its own points
 
 
@@ -206,7 +206,7 @@ class _HeadRun:
         pipeline = Pipeline(stages, whole=False, ready=ours)
         self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
         if part.end == len(plan.head):  # class codes of earlier rounds may still be changed
-            check_writers([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
+            check_las_limits([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
         for number, stage in self.expanded.items():
             used_m = part.used_m[self.steps[number] - part.begin]
             stage.update_context(outside=OUTSIDE, used_m=used_m)
@@ -226,7 +226,7 @@ class _HeadRun:
             _collect(self.views, self.pieces),
             max(self.needs_m),
             messages,
-            pipeline.left_alone,
+            pipeline.point_counts,
             self.reduced,
         )
 
@@ -460,5 +460,5 @@ def _run_with_halo(
         "dropped": points - sum(len(result.rows) for result in head.results),
         "classes": class_counts(np.concatenate(classes)),
         "messages": head.messages,
-        "left_alone": head.left_alone,
+        "point_counts": head.point_counts,
     }

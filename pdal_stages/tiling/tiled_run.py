@@ -34,11 +34,9 @@ from .write_outputs import write_file
 #: A run stops when this many tiles failed for the same reason and none succeeded (not tuned).
 _HOPELESS = 10
 # These estimate a dry run's need of disk; the true number depends on the dimensions of the stages.
-#: Bytes on disk for the results of a point until its output is written.
+#: Bytes on disk for the results of a point of each round.
 _KEPT = 60
-#: Bytes on disk for a point until the far-reaching stage has run.
-_KEPT_BEFORE = 33
-#: Bytes on disk for a cell of the raster of that stage.
+#: Bytes on disk for a cell of the raster of a far-reaching stage.
 _KEPT_OF_CELL = 112
 
 
@@ -232,12 +230,8 @@ class _Run:
                 if job.outputs:
                     progress.clear()  # messages about it start on a new line
                 yield job
-                if not done and len(failures) >= _HOPELESS and len(set(failures)) == 1:
-                    raise StageError(
-                        f"the first {len(failures)} tiles all failed for the same reason, so the "
-                        "run was stopped",
-                        found=failures[0],
-                    )
+                if not done:
+                    _stop_if_hopeless(failures)
 
     # ---- inputs ----------------------------------------------------------------------------------
 
@@ -441,6 +435,7 @@ class _Run:
             self.squares += squares
         for job in waiting:
             job.fail_with(job.jobs)
+        _stop_if_hopeless([job.reason for job in waiting])
 
     @cached_property
     def _points_of_squares(self) -> dict[tuple[int, int], int]:
@@ -512,6 +507,15 @@ class _Run:
         return partial(make_block, self._context, job.tile, squares, self.store.path(job.name))
 
 
+def _stop_if_hopeless(reasons: list[str]) -> None:
+    """Stop the run where all tiles failed for the same reason (``""``: one did not fail)."""
+    if len(reasons) >= _HOPELESS and len(set(reasons)) == 1 and reasons[0]:
+        raise StageError(
+            f"the first {len(reasons)} tiles all failed for the same reason: the run was stopped",
+            found=reasons[0],
+        )
+
+
 def _make_ready(out: Job, waiting: deque[Job]) -> None:
     """Queue an output when its last tile is done."""
     if out.state != "waiting" or any(job.state == "waiting" for job in out.jobs):
@@ -533,11 +537,9 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     if options.per == "tile":
         outputs_for(plan, survey.paths, [job.name for job in tiles])
     count, read = density.points, density.read_by(grid.size, survey.halo_units)
-    kept = float(count * _KEPT)
+    kept = float(count * _KEPT * len(plan.rounds))
     if plan.blocks is not None:
-        cells = density.area * (survey.unit / plan.blocks.cell) ** 2
-        kept += count * _KEPT_BEFORE + cells * _KEPT_OF_CELL
-    kept += sum(count * _KEPT for part in plan.rounds if part.kept and part.blocks is None)
+        kept += density.area * (survey.unit / plan.blocks.cell) ** 2 * _KEPT_OF_CELL
     largest = density.largest if options.per == "file" else 0
     summary = survey.figures(plan) | {
         "workers": options.local_workers,

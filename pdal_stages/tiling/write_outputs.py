@@ -57,13 +57,6 @@ class NewValues:
     values: Mapping[str, tuple[NDArray[np.int64] | None, NDArray]]
 
 
-def of_own_points(result: PieceResults) -> NewValues:
-    """Return results as new values for the file of a piece; only the tile's own points remain."""
-    kept = np.zeros(len(result.piece.index), bool)
-    kept[result.rows] = True
-    return NewValues(kept, {name: (result.rows, values) for name, values in result.values.items()})
-
-
 def flags_in_classes(path: str) -> bool:
     """Return whether this PDAL reads the flags of a file (LAS 1.0-1.3) as bits of the class."""
     return not pdal_env.splits_class_flags() and las.holds_flags(path)
@@ -125,10 +118,6 @@ def read_results(
         seen += dict(arrays["own"].tolist())[source.key]
         first, last = np.searchsorted(index, (start, end))
         rows = index[first:last] - start
-        if (index.size and index[-1] >= count) or kept[rows].any():
-            raise StageError(
-                "internal: two tiles hold the same point", where=source.path, found=path
-            )
         kept[rows] = True
         for field in list(points.dtype.fields or ())[1:]:
             name = field.removeprefix("dim/")
@@ -137,10 +126,9 @@ def read_results(
             values[name][rows] = points[field][first:last]
     if seen != count:
         raise StageError(
-            "the tiles do not hold all points of the file: the file changed during the run",
+            "the tiles do not hold all points of the file",
             where=source.path,
-            found=f"{seen:,} of {count:,} points",
-            cure="Start the run again with --resume",
+            found=f"{seen:,} of {count:,} points. Run it again without --resume",
         )
     return NewValues(kept, {name: (None, column) for name, column in values.items()})
 
@@ -306,10 +294,6 @@ def _in_parts(
                         "do_compress": partial.suffix.lower() == ".laz",
                     }
                     out = stack.enter_context(laspy.open(partial, mode="w", **how))
-                elif [*points_of_part.header.offsets] != [*out.header.offsets]:
-                    raise StageError(
-                        "internal: parts of a file have different offsets", found=str(partial)
-                    )
                 for chunk in points_of_part.chunk_iterator(BLOCK):
                     out.write_points(chunk)
                 count += int(points_of_part.header.point_count)
@@ -333,5 +317,10 @@ def write_tile(
     sources = [result.piece.source.path for result in results]
     tail = with_dimensions(plan.tail, plan.extra_dims, sources)
     readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
-    new = [of_own_points(result) for result in results]
+    new = []
+    for result in results:  # only the tile's own points remain
+        kept = np.zeros(len(result.piece.index), bool)
+        kept[result.rows] = True
+        values = {name: (result.rows, column) for name, column in result.values.items()}
+        new.append(NewValues(kept, values))
     return run_tail(readers, new, tail, outputs, scratch, sources)
