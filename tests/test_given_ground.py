@@ -64,7 +64,7 @@ def test_the_surface_is_that_of_the_ground_that_is_given(name):
         "HeightAboveOpening_17",
     ):  # of all points, ground or not
         assert np.array_equal(known[opening], result[opening])
-    assert figures["ground_points"] == np.count_nonzero(known["Ground"]) and "pits" not in figures
+    assert figures["ground_points"] == np.count_nonzero(known["Ground"])
 
 
 def test_points_as_far_as_its_reach_decide():

@@ -13,10 +13,9 @@ from pdal_stages.terrain import filtered_ground
 from pdal_stages.terrain.ground_blocks import (
     BLOCK_SIDE,
     GroundCells,
-    around_blocks,
-    by_block,
     cells_of_block,
     reach_of_block,
+    reduced_points,
 )
 from pdal_stages.terrain.smrf import FilterOptions
 from pdal_stages.tiling import tiled_run as run
@@ -33,14 +32,14 @@ def test_the_lowest_points_of_cells(cell):
     x[:5] += 1e7  # strays
     z[7] = -1e7
     use = rng.random(3000) < 0.9
-    lowest = around_blocks(x, y, z, use, FilterOptions(cell=cell))
+    lowest, _ = reduced_points(x, y, z, use, FilterOptions(cell=cell))
     best: dict[tuple[int, int], tuple] = {}
     for n in np.flatnonzero(use & (np.abs(z) < 1e6)):
         key = (int(np.floor(x[n] / cell)), int(np.floor(y[n] / cell)))
         best[key] = min(best.get(key, (np.inf,)), (z[n], x[n], y[n]))
     assert {(z, x, y) for x, y, z in lowest} == set(best.values())
     assert len(lowest) == len(best)
-    assert around_blocks(x, y, z, np.zeros(3000, bool), FilterOptions(cell=cell)).size == 0
+    assert reduced_points(x, y, z, np.zeros(3000, bool), FilterOptions(cell=cell))[0].size == 0
 
 
 @pytest.fixture(scope="module")
@@ -154,9 +153,9 @@ def test_what_fails_in_the_first_round_is_said_of_the_tiles_that_need_it(
 def blocks_of(points, options, near):
     """The cells of all blocks that points need, each made of the lowest points that it may look at."""
     cell = options.cell
-    low = around_blocks(*points, np.ones(points.shape[1], bool), options).T
+    low, inside = reduced_points(*points, np.ones(points.shape[1], bool), options)
+    low = low.T
     side, surroundings = BLOCK_SIDE * cell, (reach_of_block(options) + 1) * cell
-    inside = by_block(*points, np.ones(points.shape[1], bool), cell)
     results = []
     for i in range(int(near[0] // side), int(near[2] // side) + 1):
         for j in range(int(near[1] // side), int(near[3] // side) + 1):

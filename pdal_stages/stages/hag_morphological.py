@@ -13,10 +13,9 @@ from ..base.errors import NoTerrainError
 from ..terrain.ground_blocks import (
     BLOCK_SIDE,
     GroundCells,
-    around_blocks,
-    by_block,
     cells_of_block,
     reach_of_block,
+    reduced_points,
 )
 from ..terrain.heights import filtered_ground
 from ..terrain.openings import opening_names
@@ -123,9 +122,9 @@ class HagMorphological(FarReaching):
         """Return the lowest points that blocks around need, and the points inside each block."""
         x, y, z = points.axes
         usable = points.usable(self.ignore)
-        inside = by_block(x, y, z, usable, self.cell)
+        lowest, inside = reduced_points(x, y, z, usable, self._filter)
         return {
-            "around": around_blocks(x, y, z, usable, self._filter),
+            "around": lowest,
             **{inside_block(block): xyz for block, xyz in inside.items()},
         }
 

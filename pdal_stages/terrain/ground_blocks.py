@@ -113,40 +113,27 @@ def _record(openings: int) -> np.dtype:
     )
 
 
-def by_block(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    use: NDArray[np.bool_],
-    cell: float,
-) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Return the points that may be ground (m, 3) by the block that holds them, in meters.
-
-    Blocks have `BLOCK_SIDE` cells along a side.
-    """
-    rows = np.flatnonzero(use & (np.abs(z) < HIGHEST))
-    column, row = (cell_numbers(axis[rows], cell) // BLOCK_SIDE for axis in (x, y))
-    parts = group_by_key(cell_keys(column, row))
-    return {
-        (int(column[p[0]]), int(row[p[0]])): np.column_stack([axis[rows[p]] for axis in (x, y, z)])
-        for p in parts
-    }
-
-
-def around_blocks(
+def reduced_points(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     z: NDArray[np.float64],
     use: NDArray[np.bool_],
     options: FilterOptions,
-) -> NDArray[np.float64]:
-    """Return the points that blocks around need: the lowest of each cell (n, 3), meters."""
+) -> tuple[NDArray[np.float64], dict[tuple[int, int], NDArray[np.float64]]]:
+    """Return what blocks need of points that may be ground, in meters.
+
+    The lowest of each cell (n, 3), and all (m, 3) by the block that holds them. Blocks have
+    `BLOCK_SIDE` cells along a side.
+    """
     rows = np.flatnonzero(use & (np.abs(z) < HIGHEST))
-    x, y, z = x[rows], y[rows], z[rows]
-    key = cell_keys(cell_numbers(x, options.cell), cell_numbers(y, options.cell))
-    cells, number = np.unique(key, return_inverse=True)
+    xyz = np.column_stack([axis[rows] for axis in (x, y, z)])
+    x, y, z = xyz.T
+    column, row = cell_numbers(x, options.cell), cell_numbers(y, options.cell)
+    cells, number = np.unique(cell_keys(column, row), return_inverse=True)
     low = lowest_points(x, y, z, number, len(cells))
-    return np.column_stack([axis[low] for axis in (x, y, z)])
+    column, row = column // BLOCK_SIDE, row // BLOCK_SIDE
+    blocks = group_by_key(cell_keys(column, row))
+    return xyz[low], {(int(column[b[0]]), int(row[b[0]])): xyz[b] for b in blocks}
 
 
 def cells_of_block(
@@ -157,8 +144,9 @@ def cells_of_block(
 ) -> GroundCells:
     """Compute the cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
 
-    `outer` is (n, 3) of :func:`around_blocks`: all within :func:`reach_of_block` cells of the
-    block, and few more. `points` are all that may be ground in the block, in parts (n, 3).
+    `outer` are the lowest points (n, 3) of :func:`reduced_points`: all within
+    :func:`reach_of_block` cells of the block, and few more. `points` are all that may be ground in
+    the block, in parts (n, 3).
     """
     core = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     # Openings reach into cells without points.
@@ -167,7 +155,7 @@ def cells_of_block(
     low = _in_cells(outer, options)
     if not core.padded(margin).contains(low.column, low.row).any():
         return GroundCells.of_blocks([], len(options.openings))
-    raster, _ = ground_raster(low, options, margin=spill, wanted=core.padded(margin))
+    raster = ground_raster(low, options, margin=spill, wanted=core.padded(margin))
     inside = low.take(core.contains(low.column, low.row))
     needed = cells_around(raster.window, inside.column, inside.row)
     planes = surface(raster, options.near_levels, needed)

@@ -41,6 +41,7 @@ from .ground_blocks import GroundCells
 from .openings import FILL_RINGS, fill_holes, opening_names, openings_of
 from .pieces import patches
 from .smrf import (
+    FAR,
     RIM,
     CellMeans,
     FilterOptions,
@@ -93,8 +94,8 @@ def filtered_ground(
     threads : int, optional
         None or 0: every available core.
     figures : dict, optional
-        Receives counts: ``ground_points``, ``pits`` (cells whose lowest point is a low outlier),
-        ``without_terrain`` (points with no ground near; their height is 0), ``unused_points``.
+        Receives counts: ``ground_points``, ``without_terrain`` (points with no ground near; their
+        height is 0), ``unused_points``.
     **options
         `cell` (1): side of the grid's cells; `slope` (0.1): a window of radius r removes what it
         lowers by more than `slope` times r; `window` (18): radius of the largest window, half the
@@ -150,13 +151,13 @@ def _heights(
         **({"Slope": np.zeros(count)} if options.slope_too else {}),
         **{name: np.zeros(count, np.float32) for name in opening_names(options.openings)},
     }
-    counts |= {"without_terrain": 0} | ({"pits": 0} if cells is None and ground is None else {})
+    counts["without_terrain"] = 0
     if ground is not None:
         pieces = _given_pieces(points, options, ground)
     elif cells is not None:
         pieces = _known_pieces(points, options, cells)
     else:
-        pieces = _filtered_pieces(points, options, counts)
+        pieces = _filtered_pieces(points, options)
     for piece in pieces if count else ():
         dimensions = _measure(points.take(piece.rows), piece, options, threads, counts)
         rows = piece.rows if isinstance(piece.rows, slice) else piece.rows[piece.core]
@@ -168,14 +169,10 @@ def _heights(
     return out
 
 
-def _filtered_pieces(
-    points: GroundPoints, options: FilterOptions, counts: dict[str, int]
-) -> Iterator[_Piece]:
-    """Yield pieces of the cloud with the ground that the filter finds, and count low outliers."""
+def _filtered_pieces(points: GroundPoints, options: FilterOptions) -> Iterator[_Piece]:
+    """Yield pieces of the cloud with the ground that the filter finds."""
     for rows, core in patches(points.column, points.row, options.reach_of_points, options.link):
-        raster, low = ground_raster(points.take(rows), options)
-        counts["pits"] += len(low) if isinstance(core, slice) else int(np.count_nonzero(core[low]))
-        yield _Piece(rows, core, raster)
+        yield _Piece(rows, core, ground_raster(points.take(rows), options))
 
 
 def _known_pieces(
@@ -203,7 +200,7 @@ def _given_pieces(
         heights = np.where(held, place[..., 2], HOLE).astype(np.float32)
         opened = {}
         if options.openings:  # of all points, without low outliers
-            _, lowest, _ = minimum_grid(part, window, options.cell)
+            _, lowest = minimum_grid(part, window, options.cell)
             opened = dict(openings_of(fill_holes(lowest), {*options.requested_radii}))
         yield _Piece(rows, core, GroundRaster(window, heights, place, held, heights, opened), means)
 
@@ -238,7 +235,7 @@ def _measure(
     is_ground = options.is_ground(points.use, *above(planes))
     held, place = piece.means or ground_means([(points, is_ground)], cell, raster.window)
     raster = replace(raster, ground=held, place=place)
-    height, gradient = above(surface(raster, options.far_levels, needed, planes))
+    height, gradient = above(surface(raster, options.levels(FAR), needed, planes))
     nowhere = np.isnan(height)
     counts["without_terrain"] += int(np.count_nonzero(nowhere[piece.core]))
     height[nowhere] = gradient[nowhere] = 0.0

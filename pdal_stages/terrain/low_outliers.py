@@ -48,7 +48,6 @@ class LowRules(NamedTuple):
     max_grade: float = 0.15  #: that step grows by this much per meter
     max_island: int = 30  #: cells of a set of linked cells that may be outliers
     max_extent: int = 20  #: cells along either axis of such a set
-    reach_margin: int = 2  #: columns added to reaches: the support of ground as deep
 
 
 RULES = LowRules()
@@ -56,7 +55,7 @@ RULES = LowRules()
 
 def reach(side: float) -> int:
     """Return how far away, in columns of a `side` in meters, points change what is an outlier."""
-    return RULES.near + math.ceil(RULES.far_m / side) + RULES.reach_margin
+    return RULES.near + math.ceil(RULES.far_m / side) + RULES.support
 
 
 @device(_nrt=True, fastmath=set(FAST))

@@ -80,11 +80,9 @@ class DetachedRules(NamedTuple):
 
 
 RULES = DetachedRules()
-#: How far away, in meters, points can decide whether a point is of a small cluster: a component in
-#: full and its density.
-CLUSTER_REACH = (RULES.max_extent + 3 * BLOCK + 2) * SIDE
-#: How far away, in meters, points can change what a point is: the halo a tile needs.
-REACH = (low_reach(SIDE) + RULES.far + 2) * SIDE + CLUSTER_REACH
+#: How far away, in meters, points can change what a point is, the halo a tile needs: what is near,
+#: and whether that is of a small cluster, which its component in full and its density tell.
+REACH = (low_reach(SIDE) + RULES.far + 2 + RULES.max_extent + 3 * BLOCK + 2) * SIDE
 
 
 def detached_noise(

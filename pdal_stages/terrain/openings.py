@@ -24,11 +24,6 @@ from .cells import HOLE
 FILL_RINGS = 3
 
 
-def opening_radius(window: float, cell: float) -> int:
-    """Return the radius in cells of a window of about `window` meters, the middle cell counted."""
-    return max(1, round((window / cell - 1) / 2))
-
-
 def growing_radii(largest: int) -> list[int]:
     """Return radii in cells, each larger by a fifth, at least 1 and at most 2 cells.
 

@@ -20,7 +20,7 @@ from ..base.grid import GridWindow, cell_numbers
 from ..base.jit import njit
 from .cells import HOLE, lowest_points
 from .low_outliers import find_low_outliers, outlier_reach
-from .openings import FILL_RINGS, objects_of, opening_radius
+from .openings import FILL_RINGS, objects_of
 from .surface import GroundRaster, surface
 from .surface import reach as planes_reach
 
@@ -96,20 +96,15 @@ class FilterOptions:
 
     @property
     def requested_radii(self) -> list[int]:
-        """Radii of the requested openings, in cells."""
-        return [opening_radius(size, self.cell) for size in self.openings]
+        """Radii of the requested openings, in cells; the middle cell is counted."""
+        return [max(1, round((size / self.cell - 1) / 2)) for size in self.openings]
 
     @property
     def near_levels(self) -> int:
         """Levels of the provisional surface."""
-        return self._levels(NEAR)
+        return self.levels(NEAR)
 
-    @property
-    def far_levels(self) -> int:
-        """Levels of the surface that heights are measured from."""
-        return self._levels(FAR)
-
-    def _levels(self, block: float) -> int:
+    def levels(self, block: float) -> int:
         """Return how often cells are joined, 2 x 2, until they are blocks of about that side."""
         return max(1, round(math.log2(block / self.cell)))
 
@@ -170,12 +165,12 @@ class FilterOptions:
 
     @property
     def _reach_of_surfaces(self) -> int:
-        return planes_reach(self.near_levels) + planes_reach(self.far_levels)
+        return planes_reach(self.near_levels) + planes_reach(self.levels(FAR))
 
     @property
     def reach_of_cells(self) -> int:
         """Distance in cells within which cells of known ground matter to points."""
-        return planes_reach(self.far_levels) + WIDE_RIM
+        return planes_reach(self.levels(FAR)) + WIDE_RIM
 
     @property
     def link(self) -> int:
@@ -184,7 +179,7 @@ class FilterOptions:
         No step of the filter sees from a point to another across more empty land.
         """
         openings = max([self.radius, *self.requested_radii]) + 2 * FILL_RINGS
-        return max(outlier_reach(self.cell), openings, planes_reach(self.far_levels)) + RIM
+        return max(outlier_reach(self.cell), openings, planes_reach(self.levels(FAR))) + RIM
 
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
@@ -222,7 +217,7 @@ def ground_raster(
     options: FilterOptions,
     margin: int = FILL_RINGS + 1,
     wanted: GridWindow | None = None,
-) -> tuple[GroundRaster, NDArray[np.int64]]:
+) -> GroundRaster:
     """Classify the cells of the minimum grid around points into ground and objects.
 
     The steps are those of SMRF [P13]: minimum grid, low outliers, opening with growing windows;
@@ -235,15 +230,9 @@ def ground_raster(
         Empty cells on every side, one at least: points blend the four cells around them.
     wanted : GridWindow, optional
         The requested cells; the raster holds these and as many around as later steps need.
-
-    Returns
-    -------
-    raster : GroundRaster
-    low_outliers : (m,) int64
-        Indices of the points that are low outliers.
     """
     window, cell = GridWindow.enclosing(points.column, points.row).padded(margin), options.cell
-    lowest, heights, low_outliers = minimum_grid(points, window, cell)
+    lowest, heights = minimum_grid(points, window, cell)
     objects, floor, opened = objects_of(
         heights, cell, options.slope, options.radius, options.requested_radii
     )
@@ -261,7 +250,7 @@ def ground_raster(
     ground = np.isfinite(heights) & ~objects
     raster = GroundRaster(kept, heights, place, ground, floor, opened)
     _regain_ground(raster, wanted, options)
-    return raster, low_outliers
+    return raster
 
 
 def _regain_ground(raster: GroundRaster, wanted: GridWindow, options: FilterOptions) -> None:
@@ -316,7 +305,7 @@ def _among_ground(cells, lowest, ground, reach, rise, least):
 
 def minimum_grid(
     points: GroundPoints, window: GridWindow, cell: float
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Make the minimum grid of a window, without low outliers.
 
     Returns
@@ -325,8 +314,6 @@ def minimum_grid(
         Index of the lowest point of each cell, -1 where there is none.
     raster : (h, w) float32
         Its height in meters; HOLE where there is none, or a low outlier.
-    low_outliers : (m,) int64
-        Indices of the points that are low outliers.
     """
     shape, cells = (window.height, window.width), window.height * window.width
     usable = np.flatnonzero(points.use)
@@ -335,9 +322,8 @@ def minimum_grid(
     low = lowest_points(x, y, z, inside, cells).reshape(shape)
     lowest = np.append(usable, -1)[low]
     raster = np.where(lowest >= 0, points.z[lowest], HOLE).astype(np.float32)
-    outliers = find_low_outliers(raster, cell)
-    raster[outliers] = HOLE
-    return lowest, raster, lowest[outliers]
+    raster[find_low_outliers(raster, cell)] = HOLE
+    return lowest, raster
 
 
 @njit
