@@ -38,7 +38,6 @@ def cloud(seed, n, kind="even"):
         xyz = np.round(xyz * 2) / 2
     if kind == "far":
         xyz[: n // 2] += (631_000.0, 6_270_000.0, 40.0)
-        xyz[:2] = [[1e11, -1e11, 1e11], [-1e11, 1e11, -1e11]][: len(xyz[:2])]
     shares = count_shares(random.dirichlet([0.4, 0.4, 0.4], n))
     return xyz, shares
 

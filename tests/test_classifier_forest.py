@@ -38,18 +38,14 @@ def oracle(forest, values):
     return out / len(forest.tree_sizes)
 
 
-@pytest.mark.parametrize("n_rows", [0, 1, 9, 2050])
-def test_equals_sklearn_bit_for_bit(n_rows):
+def test_equals_sklearn_bit_for_bit():
     x, y = data()
     reference = RandomForestClassifier(9, random_state=1, min_samples_leaf=2).fit(x, y)
     forest = Forest.from_sklearn(reference.estimators_, x.shape[1])
-    rows = data(n_rows, seed=5)[0] if n_rows else np.zeros((0, 17), np.float32)
+    assert forest.predict_proba(np.zeros((0, 17), np.float32)).shape == (0, 4)
+    rows = data(2050, seed=5)[0]  # more than walk a tree together
     ours = forest.predict_proba(rows)
-    assert ours.shape == (n_rows, 4)
-    if n_rows:
-        theirs = reference.set_params(n_jobs=1).predict_proba(rows)
-        assert np.array_equal(ours, theirs)
-        assert np.array_equal(ours.argmax(axis=1), reference.predict(rows))
+    assert np.array_equal(ours, reference.set_params(n_jobs=1).predict_proba(rows))
 
 
 @settings(max_examples=12, deadline=None)

@@ -31,9 +31,7 @@ def test_blocks_are_whole_and_the_gap_is_kept(seed, folds, block, gap):
     for entry in np.unique(cell, axis=0):
         assert len(set(fold[(cell == entry).all(axis=1)].tolist())) == 1
     p = random.permutation(400)
-    assert np.array_equal(
-        fold[p], block_folds(xy[p], label[p], folds, block)
-    )  # the order does not matter
+    assert np.array_equal(fold[p], block_folds(xy[p], label[p], folds, block))
     for number in range(folds):
         train, held = split(xy, fold, number, gap)
         assert (fold[held] == number).all() and not train[held].any()
@@ -57,16 +55,12 @@ def test_every_fold_gets_its_share_of_every_class():
 
 def test_folds_are_blocks_or_whole_surveys():
     random = np.random.default_rng(0)
-    xy, label, first = (
-        random.random((900, 2)) * (90, 70),
-        random.integers(0, 2, 900),
-        np.ones(900, int),
-    )
+    xy = random.random((900, 2)) * (90, 70)
+    label, first = random.integers(0, 2, 900), np.ones(900, int)
     folds = Folds.of_ground(xy, label, first, ("x", "y"), 4)
     assert folds.count == 4 and not folds.surveys
-    far = (
-        random.random((500, 3)) * 1000 - 500
-    )  # ground without samples belongs to some fold as well
+    # Ground without samples belongs to some fold as well.
+    far = random.random((500, 3)) * 1000 - 500
     assert set(folds.points(far).tolist()) == {0, 1, 2, 3}
     folds = Folds.of_ground(xy, label, first, ("x", "y", "z", "x"), 5)
     assert folds.count == 3 and sorted(folds.surveys.values()) == [0, 1, 2]

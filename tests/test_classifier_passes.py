@@ -1,7 +1,6 @@
 """Models of several passes: what they gain, and that nothing but the cloud decides what comes out."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from test_classifier_training import SMALL, scene
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError
 from pdal_stages.classifier import auto_context, model_file
-from pdal_stages.classifier.training_options import CONTEXT_OF_BASE, DEFAULT_CONTEXT
 from pdal_stages.features import FeatureEngine
 
 FEW = {
@@ -168,13 +166,3 @@ def test_options():
     for bad in ({"passes": 4}, {"passes": 0}, {"passes": 2, "context": []}, {"context": "box3"}):
         with pytest.raises(OptionError):
             TrainingOptions(**bad)
-
-
-def test_what_is_read_by_default_and_under_a_base(two):
-    alone, on_top = TrainingOptions(), TrainingOptions(base=two)
-    assert alone.context == DEFAULT_CONTEXT and "own" not in alone.context
-    assert on_top.context == CONTEXT_OF_BASE and "own" in on_top.context
-    assert (alone.passes, on_top.passes) == (2, 1) and on_top.voxel == two.voxel
-    assert replace(alone, seed=3).context == DEFAULT_CONTEXT
-    model = learned(context=None)
-    assert model.passes[1].context.tokens == DEFAULT_CONTEXT and model.plan.halo_m >= 16.0

@@ -1,21 +1,14 @@
 """Samples: as many as asked for, spread over the class, the same whatever the order of the points."""
 
 import numpy as np
-import pytest
 
-from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.sampling import draw_samples
 
 
 def chosen(clouds, samples):
     """Coordinates, class and weight of each sample, sorted."""
-    rows = [
-        (*clouds[c][0][r], int(k), int(w))
-        for c, r, k, w in zip(
-            samples.cloud, samples.row, samples.label, samples.weight, strict=True
-        )
-    ]
-    return sorted(rows)
+    each = zip(samples.cloud, samples.row, samples.label, samples.weight, strict=True)
+    return sorted((*clouds[c][0][r], int(k), int(w)) for c, r, k, w in each)
 
 
 def test_counts_and_duplicates(random_cloud):
@@ -72,17 +65,3 @@ def test_spread_over_space_and_not_clumped():
 
     drawn = random.choice(len(xyz), 1600, replace=False)
     assert nearest(xyz[samples.row, :2]) > 1.1 * nearest(xyz[drawn, :2])
-
-
-def test_a_class_without_points_is_an_error(random_cloud):
-    with pytest.raises(OptionError, match="no samples"):
-        draw_samples([(random_cloud(10), np.zeros(10, np.int16))], 2, 5, 0)
-
-
-def test_no_more_samples_than_the_largest_class_has(random_cloud):
-    """Weights, and with them the work of training, stay those of the points that are there."""
-    xyz = random_cloud(1000, seed=4)
-    position = np.zeros(1000, np.int16)
-    position[:100] = 1
-    samples = draw_samples([(xyz, position)], 2, 99_999_999, seed=0)
-    assert samples.weight.sum() == 1800 and samples.weight.max() == 9

@@ -88,11 +88,6 @@ def test_what_is_not_carried_is_refused_by_name(stage, says):
     assert says in str(caught.value)
 
 
-def test_only_a_few_stages():
-    with pytest.raises(ModelError, match="2000 characters"):
-        check([HAG] * 100)
-
-
 _JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=True) | st.text(max_size=20),
     lambda inside: (

@@ -3,7 +3,6 @@
 import json
 import shutil
 import zipfile
-from dataclasses import replace
 
 import laspy
 import numpy as np
@@ -19,12 +18,8 @@ import pdal_stages as ps
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import ModelError, OptionError, StageError
 from pdal_stages.classifier import model_file
-from pdal_stages.classifier.auto_context import classify
-from pdal_stages.classifier.context_features import count_shares
 from pdal_stages.classifier.feature_forest import Blend
-from pdal_stages.classifier.interface import PredictRequest
 from pdal_stages.classifier.training_clouds import label_classes
-from pdal_stages.features import FeatureEngine
 
 BEFORE = (2, 5, 6)
 
@@ -216,43 +211,6 @@ def test_a_manifest_that_contradicts_itself(base, tmp_path, change):
     with pytest.raises(ModelError):
         model_file.write(tmp_path / "m", manifest, [entry.arrays() for entry in model.passes])
         load_model(tmp_path / "m")
-
-
-def of_the_base(base, xyz, dimensions):
-    """What a base hands on of every point of a cloud without voxels, as it is counted."""
-    out = np.empty((len(xyz), len(base.classes)), np.uint16)
-    request = PredictRequest(xyz, dimensions)
-    for block in classify(base.weighted_passes, request):
-        out[block.rows] = count_shares(block.probabilities)
-    return out
-
-
-def computed(features, xyz, dimensions):
-    """The features of every point."""
-    engine = FeatureEngine(xyz, features.plan, bins=features.bins)
-    return engine.table(
-        dimensions={name: dimensions[name] for name in features.plan.dimensions}
-    ).values
-
-
-def test_equals_the_rule_by_hand(base):
-    """Features of its own, the base's probabilities around each point, the forest, the rule."""
-    from test_classifier_context import reference
-
-    base = replace(base, info={**base.info, "voxel": 0.0})
-    # Other features than the base's, of the same neighborhoods.
-    model = on_top(base, keep=base.codes.tolist()[:-1], n=200, feature_set="geometric")
-    xyz, _, dimensions = scene(seed=7, n=4000)
-    last = model.passes[-1]
-    rows = np.arange(0, len(xyz), 9)
-    columns = reference(xyz, of_the_base(base, xyz, dimensions), rows, last.context)
-    values = computed(last.features, xyz, dimensions)[rows]
-    grown = last.forest.predict_proba(np.hstack([values, columns]))
-    ours = columns[:, : len(base.codes)].astype(float)
-    ours /= ours.sum(axis=1, keepdims=True)
-    p = by_hand(ours, grown, last.blend.before, list(last.blend.labeled), last.blend.trusted)
-    got = model.predict(xyz, dimensions, probabilities=True).probabilities[rows]
-    assert np.allclose(got, p, atol=1e-6)
 
 
 @pytest.mark.pdal
