@@ -72,15 +72,6 @@ def test_stdin_and_expand(job, run, monkeypatch, tmp_path):
     assert json.loads((tmp_path / "plain.json").read_text())["pipeline"][1]["function"] == "stage"
 
 
-def test_standard_input_is_named_in_tiles_too(run, monkeypatch):
-    import io
-
-    for words in ([], ["--tile", "50"]):
-        monkeypatch.setattr(sys, "stdin", io.StringIO('["in.las", {"type": ]'))
-        code, _, err = run("pipeline", "--stdin", *words)
-        assert code == 1 and "standard input, line 1" in err
-
-
 def test_validate(job, run, tmp_path):
     assert run("validate", job)[0] == 0
     code, out, _ = run("pipeline", "--validate", job)
@@ -145,22 +136,3 @@ def test_help_fits_a_screen(command, capsys, monkeypatch):
         re.findall(r"--[^ ]*\w+", "\n".join(lines))
     )
     assert bool(flags) == ("--help-all" in lines[-1])
-
-
-@pytest.mark.parametrize(
-    ("command", "told"),
-    [("train", "Number of trees (default: 50)"), ("objects", "up to 4 (default: 0.5 m)")],
-)
-def test_help_tells_the_defaults_of_options_of_stages(command, told, capsys):
-    with pytest.raises(SystemExit):
-        main([command, "--help-all"])
-    assert told in " ".join(capsys.readouterr().out.split())
-
-
-def test_no_command_shows_the_help(capsys):
-    shown = []
-    for words in ([], ["--help"]):
-        with pytest.raises(SystemExit) as ended:
-            main(words)
-        shown.append((ended.value.code, capsys.readouterr().out))
-    assert shown[0] == shown[1] and "classify" in shown[0][1]

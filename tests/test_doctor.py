@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import pytest
 from processes import ended
 
 from pdal_stages import cli
-from pdal_stages.plugin import doctor
 
 pytestmark = pytest.mark.pdal
 
@@ -34,23 +32,3 @@ def test_what_is_missing_has_its_cure(tmp_path):
     assert any(
         line.startswith("ok      machine") for line in lines
     )  # one fault does not hide the next
-
-
-def test_another_python_is_told(tmp_path, monkeypatch):
-    def run(stages):
-        Path(stages[1]["pdalargs"]["answer"]).write_text(
-            "/other\nModuleNotFoundError: No module named 'pdal_stages'"
-        )
-
-    interpreter = doctor._python_of("filters.python", run)
-    assert interpreter.cure == "/other/bin/python -m pip install pdal-stages" and "MISSING" in str(
-        interpreter
-    )
-
-    def another(stages):
-        Path(stages[1]["pdalargs"]["answer"]).write_text(
-            "/other\n/other/lib/pdal_stages/__init__.py"
-        )
-
-    assert "another pdal_stages" in doctor._python_of("filters.python", another).result
-    assert "did not run" in doctor._python_of("filters.python", lambda stages: None).result

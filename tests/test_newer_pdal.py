@@ -79,13 +79,6 @@ def test_copc_is_written(cloud, tmp_path):
             ps.run_pipeline([read])
 
 
-def test_pdals_expressions_after_a_stage_of_ours(cloud):
-    value = ["Classification = 1", "Classification = 9 WHERE HeightAboveGround > 3"]
-    array = ps.run_pipeline([str(cloud), HAG, {"type": "filters.assign", "value": value}]).arrays[0]
-    assert set(np.unique(array["Classification"])) == {1, 9}
-    assert np.array_equal(array["Classification"] == 9, array["HeightAboveGround"] > 3)
-
-
 # ---- python-pdal -------------------------------------------------------------------------------------------
 
 

@@ -41,23 +41,6 @@ def test_conda_asks_for_what_pip_asks_for(file):
         assert f"- {_CONDA.get(name, name)} >={bound}\n" in text, name
 
 
-@pytest.mark.parametrize("name", ["recipe/recipe.yaml", "recipe/plugin/recipe.yaml"])
-def test_recipes_are_rendered(name):
-    """By the program that builds conda-forge's packages, which refuses fields that it does not know."""
-    built = pytest.importorskip("rattler_build")
-    variants = built.VariantConfig.from_yaml(
-        "python_min: ['3.10']\npython: ['3.12.*']\ncxx_compiler: [gxx]\nc_stdlib: [sysroot]\nc_stdlib_version: ['2.17']\n"
-    )
-    (rendered,) = built.Stage0Recipe.from_file(str(ROOT / name)).render(variants)
-    recipe = rendered.recipe
-    assert str(recipe.package.version) == __version__
-    assert any(
-        str(requirement).startswith("python-pdal >=3.5") for requirement in recipe.requirements.run
-    )
-    with pytest.raises(Exception, match="unknown top-level field"):
-        built.Stage0Recipe.from_yaml((ROOT / name).read_text() + "requirments: {}\n")
-
-
 @pytest.mark.slow
 def test_a_wheel_has_all_that_it_needs(tmp_path):
     """Built from a copy, installed into a clean environment whose packages are this one's."""

@@ -8,17 +8,10 @@ import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.base.errors import OptionError, PipelineError
-from pdal_stages.pipeline import pdal as pdal_env
+from pdal_stages.base.errors import OptionError
 from pdal_stages.stages.hag_minima import HagMinima
 
 HAG = "filters.hag_minima"
-
-
-@pytest.mark.parametrize("option", ["option_file", "where_merge"])
-def test_what_ours_do_not_have_is_refused(option):
-    with pytest.raises(OptionError, match=rf"filters\.hag_minima: there is no option '{option}'"):
-        ps.Pipeline(["in.las", {"type": HAG, option: "true"}])
 
 
 @pytest.mark.parametrize(
@@ -84,7 +77,3 @@ def test_file_names_as_objects(tmp_path, write_las):
     assert out.exists() and not list(tmp_path.glob(".*"))
     (tmp_path / "job.json").write_text(json.dumps(stages))
     assert ps.run_pipeline(tmp_path / "job.json").arrays
-    if pdal_env.version() < (2, 9, 0):
-        stages[0]["filename"]["headers"] = {"a": "b"}
-        with pytest.raises(PipelineError):
-            ps.run_pipeline(stages)

@@ -211,32 +211,7 @@ def test_split_views_stay_apart(cloud, tmp_path):
     assert not list(tmp_path.glob(".*partial*"))
 
 
-def test_where_leaves_the_others_alone(cloud, model):
-    stages = [str(cloud), {"type": "filters.hag_minima"}]
-    classifier = {"type": "filters.modelclassifier", "model": str(model)}
-    everything = ps.run_pipeline([*stages, classifier]).arrays[0]
-    nine = {"type": "filters.assign", "assignment": "Classification[:]=9"}
-    part = ps.run_pipeline([*stages, nine, {**classifier, "where": "X < 500030 && Z > 0"}]).arrays[
-        0
-    ]
-    inside = part["X"] < 500_030
-    assert np.array_equal(part["Classification"][inside], everything["Classification"][inside])
-    assert (part["Classification"][~inside] == 9).all()
-    assert np.array_equal(part["Reliability"][inside], everything["Reliability"][inside])
-
-
 # ---- errors ----------------------------------------------------------------------------------------------
-
-
-def test_a_missing_dimension_names_the_stage_that_makes_it(cloud, tmp_path, model):
-    out = tmp_path / "out.laz"
-    out.write_bytes(b"older result")
-    classifier = {"type": "filters.modelclassifier", "model": str(model), "tag": "c"}
-    says = r"filters\.modelclassifier \(tag 'c'\).*HeightAboveGround.*filters\.hag_minima"
-    with pytest.raises(DimensionError, match=says):
-        ps.run_pipeline([str(cloud), classifier, str(out)])
-    assert out.read_bytes() == b"older result"
-    assert not list(tmp_path.glob(".*partial*"))
 
 
 def test_too_many_features_for_one_las_record(cloud, tmp_path):

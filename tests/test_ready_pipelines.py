@@ -193,15 +193,3 @@ def test_rasters_of_points_with_flags(tmp_path, write_las, pdal_program, program
     for old, new in zip(outputs[:2], outputs[2:], strict=True):
         assert len(old) in range(39**2, 42**2) and np.array_equal(old, new)
         assert np.abs(old[old != -9999]).max() < 1
-
-
-@pytest.mark.parametrize("name", ["classify-on-smrf-ground", "classify-regularized"])
-def test_flags_stay_as_the_docs_say(tmp_path, write_las, ready_models, name):
-    source = flagged(write_las, tmp_path / "in.las", 1)
-    model = ready_models / ("smrf.model" if "smrf" in name else "classes.model")
-    las_14 = {"output.minor_version": 4, "output.dataformat_id": 6}
-    run(name, source, tmp_path / "o.las", model, more=las_14)
-    before, after = laspy.read(source), laspy.read(tmp_path / "o.las")
-    for flag in ("key_point", "synthetic", "withheld"):
-        assert np.array_equal(before[flag], after[flag]), flag
-    assert (np.asarray(after.classification) == 2).mean() > 0.95

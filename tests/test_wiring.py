@@ -38,16 +38,6 @@ def filter_(*inputs, **more):
 #: Stages, and how many files PDAL writes where there is one end.
 WHOLE = {
     "a line": ([FAUX, filter_(), writer("1.las"), writer("2.las")], 2),
-    "joined again": (
-        [
-            FAUX,
-            filter_(tag="f"),
-            writer("1.las", "f", tag="a"),
-            writer("2.las", "f", tag="b"),
-            filter_("a", "b"),
-        ],
-        2,
-    ),
     "several readers": ([FAUX, FAUX, filter_(), writer("1.las")], 1),
 }
 SEVERAL_ENDS = {
@@ -59,7 +49,6 @@ SEVERAL_ENDS = {
         [{**FAUX, "tag": "A"}, {**FAUX, "count": 7}, writer("1.las", "A")],
         "readers.faux",
     ),
-    "inputs again": ([{**FAUX, "tag": "A"}, FAUX, filter_("A"), writer("1.las")], "readers.faux"),
 }
 
 
