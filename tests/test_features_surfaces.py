@@ -156,9 +156,9 @@ def test_plans():
     assert not {*SURFACE_FEATURES} & {name.split("_")[0] for name in FeaturePlan.parse("k10").names}
     assert FeaturePlan.from_dict(plan.to_dict()) == plan
     for spec in ("s1", "kopt", "ropt"):
-        with pytest.raises(OptionError, match="k20 and the like"):
+        with pytest.raises(OptionError, match="knn only"):
             FeaturePlan.parse(spec, "NormalAgreement")
-    with pytest.raises(OptionError, match="belongs to none"):
+    with pytest.raises(OptionError, match="none of the neighborhoods"):
         FeaturePlan.parse("k10", "NormalAgreement_k20")
 
 

@@ -186,42 +186,17 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         )
         return curvatures
 
-    def measure_shapes(self, points: Axes, shapes: Shapes, fitted: Fitted) -> None:
-        """Write the metrics of all pulls into `shapes`."""
-        for search in self.searches:
-            self.choose(search, points, fitted, shapes)
-
-    def fill(
-        self, points: Axes, copies: np.ndarray, fitted: Fitted, out: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Compute the columns of these neighborhoods for a block of queries, neighbors at best.
-
-        Parameters
-        ----------
-        points : (x, y, z), (m,) float64 each
-        copies : (m,) int64
-            How many of the user's queries each one stands for.
-        fitted : Fitted
-        out : (m, F) float32
-
-        Returns
-        -------
-        few : (neighborhoods,) int64
-            Numbers of queries with fewer than three points.
-        far : (neighborhoods,) int64
-            Numbers of queries whose result depends on points farther than the plan's halo.
-        reach : float
-            Meters to the farthest of all these points.
-        """
-        few, far = np.zeros((2, len(self)), np.int64)
-        reach, shapes = 0.0, self.shapes(points, fitted)
+    def fill(self, points: Axes, copies, fitted, shapes, out):
+        """Compute a block of queries; see :meth:`NeighborhoodGroup.fill`."""
+        few, far, reach = np.zeros(len(self), np.int64), {}, 0.0
         for search in self.searches:
             table = self.choose(search, points, fitted, shapes, out)
             for k, rows in zip(search.numbers.tolist(), table, strict=True):
                 finish(rows, 0.0, points[2], few[k : k + 1], copies, self.columns[k], out)
-                far[k] += int(copies[rows[M.REACH] > self.halo_m].sum())
+                if count := int(copies[rows[M.REACH] > self.halo_m].sum()):
+                    far[self.tokens[k]] = count
                 reach = max(reach, float(rows[M.REACH].max(initial=0.0)))
-        return few, far, reach
+        return dict(zip(self.tokens, few.tolist(), strict=True)), far, reach
 
     def choose(
         self,

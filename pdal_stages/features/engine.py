@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +19,6 @@ from ..base.threads import map_blocks, resolve_threads
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .point_grid import CellGrid, build_grid, check_xyz
 from .shape_distributions import SAMPLES, Fitted, ShapeBins, smallest_hashes
-
-if TYPE_CHECKING:
-    from .adaptive import AdaptiveNeighborhoods
-    from .fixed_radius import FixedRadius
-
 
 #: Rows of a block, whatever the memory allows: large enough that a block's calls cost little, small
 #: enough that Ctrl-C, which waits for the blocks in work, comes at once. Not tuned.
@@ -121,7 +116,7 @@ class FeatureEngine:
         self.cloud = check_xyz(xyz)
         self.grid = build_grid(self.cloud, plan.cell) if grid is None else grid
         self._lock = threading.RLock()
-        self._parts: tuple[FixedRadius, AdaptiveNeighborhoods | None] | None = None
+        self._groups: list[Any] = []
         self.report = Report({"points": len(self.grid.order), "queries": 0, "fewer_than_three": {}})
 
     def __len__(self) -> int:
@@ -154,10 +149,8 @@ class FeatureEngine:
 
         The plan must have an adaptive neighborhood.
         """
-        adaptive = self.neighborhoods()[1]
-        assert adaptive is not None
         out = np.empty(len(self))
-        out[self.grid.order] = adaptive.curvatures(self.threads)
+        out[self.grid.order] = self.neighborhoods()[1].curvatures(self.threads)
         return out
 
     def shape_values(self, rows: np.ndarray, threshold: float | None) -> dict[str, np.ndarray]:
@@ -167,32 +160,25 @@ class FeatureEngine:
         """
         x, y, z = np.ascontiguousarray(self.cloud[rows].T)
         values: dict[str, np.ndarray] = {}
-        for group in filter(None, self.neighborhoods()):
+        for group in self.neighborhoods():
             values |= group.shape_values((x, y, z), Fitted(None, threshold, self.seed))
         shaped = (c.neighborhood.token for c in self.plan.layout if c.shapes)
         return {token: values[token] for token in shaped}
 
-    def neighborhoods(self) -> tuple[FixedRadius, AdaptiveNeighborhoods | None]:
-        """Return the plan's neighborhoods, prepared for the cloud once."""
+    def neighborhoods(self) -> list[Any]:
+        """Return the plan's neighborhoods, prepared for the cloud once: fixed, then adaptive."""
         with self._lock:
-            if self._parts is None:
+            if not self._groups:
                 from .fixed_radius import FixedRadius
 
-                adaptive = None
+                self._groups.append(FixedRadius(self.grid, self.plan))
                 if any(c.at and not c.neighborhood.fixed for c in self.plan.layout):
                     from .adaptive import AdaptiveNeighborhoods
 
-                    adaptive = AdaptiveNeighborhoods(self.grid, self.plan, self.threads)
-                self._parts = FixedRadius(self.grid, self.plan), adaptive
-            return self._parts
+                    self._groups.append(AdaptiveNeighborhoods(self.grid, self.plan, self.threads))
+            return self._groups
 
-    def run(
-        self,
-        queries: npt.ArrayLike | None = None,
-        *,
-        dimensions: Given = None,
-        memory_mb: float = 512,
-    ) -> Run:
+    def run(self, queries: npt.ArrayLike | None = None, **options: Any) -> Run:
         """Return the blocks of queries to compute.
 
         ``run.computed()`` computes them on every core. A classifier computes a block's features
@@ -218,7 +204,7 @@ class FeatureEngine:
         DimensionError
             Where a dimension of the plan is missing, or has not one value per query.
         """
-        return Run(self, queries, dimensions, memory_mb)
+        return Run(self, queries, **options)
 
     def table(
         self,
@@ -259,8 +245,8 @@ class Run:
         self,
         engine: FeatureEngine,
         queries: npt.ArrayLike | None,
-        dimensions: Given,
-        memory_mb: float,
+        dimensions: Given = None,
+        memory_mb: float = 512,
     ) -> None:
         self.engine, self.plan, self.threads = engine, engine.plan, engine.threads
         self.indices = None if queries is None else np.arange(len(engine))[queries]  # type: ignore[index]
@@ -279,7 +265,7 @@ class Run:
         if not count:
             return
         engine.fit()
-        self.fixed, self.adaptive = engine.neighborhoods()
+        engine.neighborhoods()  # prepared here, once, with all threads
         x, y, z = self.grid.x, self.grid.y, self.grid.z
         new = np.ones(count, np.bool_)
         new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1]) | (z[1:] != z[:-1])
@@ -304,13 +290,13 @@ class Run:
         points = grid.x[at], grid.y[at], grid.z[at]
         width = len(plan.names)
         values = np.empty((len(at), width), np.float32)
-        few_fixed = self.fixed.fill(points, copies, engine.fitted, values)
-        few, far, reach = dict(zip(self.fixed.tokens, few_fixed.tolist(), strict=True)), {}, 0.0
-        if self.adaptive is not None:
-            tokens = self.adaptive.tokens
-            counts, beyond, reach = self.adaptive.fill(points, copies, engine.fitted, values)
-            few |= dict(zip(tokens, counts.tolist(), strict=True))
-            far = {token: n for token, n in zip(tokens, beyond.tolist(), strict=True) if n}
+        few: dict[str, int] = {}
+        far: dict[str, int] = {}
+        reach = 0.0
+        for group in engine.neighborhoods():
+            shapes = group.shapes(points, engine.fitted)
+            counts = group.fill(points, copies, engine.fitted, shapes, values)
+            few, far, reach = few | counts[0], far | counts[1], max(reach, counts[2])
         if len(at) < last - first:
             values = np.repeat(values, copies, axis=0)
         positions = grid.order[first:last].astype(np.int64)

@@ -45,39 +45,14 @@ class FixedRadius(NeighborhoodGroup):
         spherical = [c.neighborhood.kind == "sphere" for c in self.chosen]
         self.radii = Radii(radius, np.array(spherical, np.float64), widths_of(radius, grid.cell))
 
-    def fill(self, points: Axes, copies: np.ndarray, fitted, out: np.ndarray) -> np.ndarray:
-        """Compute the columns of these neighborhoods for a block of queries.
-
-        Parameters
-        ----------
-        points : (x, y, z), (m,) float64 each
-            Queries, those of one cell one after the other.
-        copies : (m,) int64
-            How many of the user's queries each one stands for.
-        fitted : Fitted
-        out : (m, F) float32
-
-        Returns
-        -------
-        few : (neighborhoods,) int64
-            Numbers of queries with fewer than three points.
-        """
-        few = np.zeros(len(self), np.int64)
-        table = self._run(points, self.shapes(points, fitted), out)
+    def fill(self, points: Axes, copies, fitted, shapes, out):
+        """Compute a block of queries; see :meth:`NeighborhoodGroup.fill`."""
+        few, table = np.zeros(len(self), np.int64), np.empty((len(self), len(M), len(points[0])))
+        fixed_block(self.grid, points, self.radii, shapes, table, out)
         for k, (radius, spherical) in enumerate(zip(*self.radii[:2], strict=True)):
             volume = 4.0 / 3.0 * math.pi * radius**3 if spherical else math.pi * radius * radius
             finish(table[k], volume, points[2], few[k : k + 1], copies, self.columns[k], out)
-        return few
-
-    def measure_shapes(self, points: Axes, shapes, fitted) -> None:
-        """Write the metrics of all pulls into `shapes`."""
-        self._run(points, shapes, np.empty((len(points[0]), 0), np.float32))
-
-    def _run(self, points: Axes, shapes, out: np.ndarray) -> np.ndarray:
-        """Return moments (neighborhoods, len(M), m); write shapes where `shapes` says."""
-        table = np.empty((len(self), len(M), len(points[0])))
-        fixed_block(self.grid, points, self.radii, shapes, table, out)
-        return table
+        return dict(zip(self.tokens, few.tolist(), strict=True)), {}, 0.0
 
 
 def widths_of(radii: np.ndarray, cell: float) -> np.ndarray:

@@ -11,7 +11,6 @@ A new kind of neighborhood has its word in ``_TOKEN``, ``_KNOWN`` and ``_CURE``,
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -60,8 +59,10 @@ MOST = 64
 SIDES = tuple(2.0**k for k in range(-3, 7))
 
 _KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
+_NUMBER = r"(?:\d+(?:\.\d*)?|\.\d+)"
 _TOKEN = re.compile(
-    r"(?P<head>kopt|ropt|copt|c|s|k)(?P<value>\d+(?:\.\d*)?|\.\d+)?(?:\((?P<inner>[^()]*)\))?"
+    rf"(?P<kind>[csk])(?P<size>{_NUMBER})"
+    rf"|(?P<adaptive>kopt|ropt|copt)(?:\((?P<values>{_NUMBER}(?:,{_NUMBER})*)\))?"
 )
 _CURE = (
     "Write c2 (vertical cylinder of 2 m radius), s1 (sphere of 1 m), k50 (50 nearest), "
@@ -145,15 +146,13 @@ def parse_neighborhoods(spec: str | Iterable[str]) -> list[Neighborhood]:
         raise OptionError("no neighborhood was given", found=repr(spec), cure=_CURE)
     if len(parsed) > MOST:
         raise OptionError(f"at most {MOST} neighborhoods can be used together", found=len(parsed))
-    suffixes: dict[str, str] = {}
-    # ropt(1,2.5,1) and ropt(1.2,5,1) would share dimension names
-    for token, neighborhood in parsed.items():
-        suffix = neighborhood.suffix
-        if suffixes.setdefault(suffix, token) != token:
-            raise OptionError(
-                f"'{suffixes[suffix]}' and '{token}' would both be called ..._{suffix}",
-                cure="Use them in two stages",
-            )
+    suffixes = {neighborhood.suffix for neighborhood in parsed.values()}
+    if len(suffixes) < len(parsed):  # ropt(1,2.5,1) and ropt(1.2,5,1) would share dimension names
+        raise OptionError(
+            "two neighborhoods have the same suffix",
+            found=", ".join(parsed),
+            cure="Use them in two stages",
+        )
     return list(parsed.values())
 
 
@@ -179,53 +178,27 @@ def _parse_token(text: str) -> Neighborhood:
     match = _TOKEN.fullmatch(word)
     if match is None:
         raise OptionError(f"unknown neighborhood '{text}'", cure=suggest(word, _KNOWN) + _CURE)
-    head, value, inner = match["head"], match["value"], match["inner"]
-    if len(head) > 1:
-        if value is not None:
-            raise OptionError(f"unknown neighborhood '{text}'", cure=_CURE)
-        return _parse_adaptive(text, head, inner)
-    if value is None or inner is not None:
-        raise OptionError(f"the neighborhood '{text}' needs a size, as in {head}2", cure=_CURE)
-    size = float(value)
-    if head == "k":
-        if size != int(size) or not 1 <= size <= MAX_K:
-            raise OptionError(f"k must be a whole number from 1 to {MAX_K}", found=text)
-        return Neighborhood("knn", (size,))
-    if not (MIN_RADIUS <= size <= MAX_RADIUS):
-        raise OptionError(
-            f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} meters", found=text
-        )
-    return Neighborhood("cylinder" if head == "c" else "sphere", (_rounded(size),))
-
-
-def _parse_adaptive(text: str, head: str, inner: str | None) -> Neighborhood:
-    try:
-        values = tuple(float(v) for v in inner.split(",")) if inner else _DEFAULTS[head]
-    except ValueError:
-        raise OptionError(
-            "the values in parentheses must be numbers", found=text, cure=_CURE
-        ) from None
-    if not all(math.isfinite(v) for v in values):
-        raise OptionError("the values in parentheses must be finite", found=text)
-    fault = None
-    if head == "kopt":
-        whole = len(values) == 2 and all(v == int(v) for v in values)
-        if not whole or not 2 <= values[0] <= values[1] <= MAX_K:
-            fault = f"two whole numbers, kopt(k_min,k_max), 2 <= k_min <= k_max <= {MAX_K}"
-    elif head == "ropt":
-        least = f"each at least {MIN_RADIUS}, r_min <= r_max"
-        if (
-            len(values) != 3
-            or not MIN_RADIUS <= min(values) <= values[0] <= values[1] <= MAX_RADIUS
-        ):
-            fault = f"meters, {head}(r_min,r_max,step), {least}"
-        elif (values[1] - values[0]) / values[2] > 1000:
-            fault = "at most 1000 radii: make the step larger"
-    elif values:
-        fault = "no values: write copt"
-    if fault:
-        raise OptionError(f"{head} takes {fault}", found=text)
-    return Neighborhood(head, tuple(_rounded(v) for v in values))
+    kind = match["kind"] or match["adaptive"]
+    listed = match["size"] or match["values"]
+    values = tuple(map(float, listed.split(","))) if listed else _DEFAULTS[kind]
+    if kind in ("k", "kopt"):
+        length, least = (1, 1) if kind == "k" else (2, 2)
+        whole = len(values) == length and all(v == int(v) for v in values)
+        fine = whole and least <= values[0] <= values[-1] <= MAX_K
+        rule = f"k must be a whole number from {least} to {MAX_K}, of kopt(k_min,k_max) two of them"
+    elif kind == "copt":
+        fine, rule = not values, "copt takes no values"
+    elif kind == "ropt":
+        fine = len(values) == 3 and MIN_RADIUS <= min(values) <= values[0] <= values[1]
+        fine = fine and values[1] <= MAX_RADIUS and (values[1] - values[0]) / values[2] <= 1000
+        rule = f"ropt(r_min,r_max,step) takes at most 1000 radii from {MIN_RADIUS} m on"
+    else:
+        fine = MIN_RADIUS <= values[0] <= MAX_RADIUS
+        rule = f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} meters"
+    if not fine:
+        raise OptionError(rule, found=text)
+    kind = {"c": "cylinder", "s": "sphere", "k": "knn"}.get(kind, kind)
+    return Neighborhood(kind, tuple(_rounded(value) for value in values))
 
 
 def _rounded(value: float) -> float:

@@ -167,20 +167,12 @@ def expand_words(neighborhoods: Sequence[Neighborhood], words: Sequence[str]) ->
     known = features_of(neighborhoods)
     wanted = {name for word in words for name in GROUPS.get(word, (word,))}
     names = tuple(full for full, (_, feature) in known.items() if {full, feature} & wanted)
-    tokens = ", ".join(neighborhood.token for neighborhood in neighborhoods)
-    if lost := [word for word in words if word not in {*GROUPS, *BY_NAME, *names}]:
+    lost = [word for word in words if word not in {*GROUPS, *BY_NAME, *names}]
+    if lost or not names:
+        kinds = {kind for name in wanted & BY_NAME.keys() for kind in BY_NAME[name].kinds}
         raise OptionError(
-            f"the feature '{lost[0]}' belongs to none of the neighborhoods", found=tokens
-        )
-    if not names:
-        cure = None
-        if wanted & {*SURFACE_FEATURES}:
-            cure = "Neighbors' surfaces exist for k20 and the like only"
-        if "Radius" in wanted:
-            cure = "Radius exists for kopt, ropt and copt only"
-        raise OptionError(
-            f"none of the neighborhoods has the feature '{', '.join(words)}'",
-            found=tokens,
-            cure=cure,
+            f"none of the neighborhoods has the feature '{', '.join(lost or words)}'",
+            found=", ".join(neighborhood.token for neighborhood in neighborhoods),
+            cure=f"It exists for {', '.join(sorted(kinds))} only" if kinds and not lost else None,
         )
     return names

@@ -86,6 +86,10 @@ COMPARABLE: dict[str, tuple[Callable, Callable]] = {
     "D4": (lambda t: 6 * t**3, lambda v: np.cbrt(v / 6)),
 }
 
+_WRONG = (
+    f"must be {INNER} finite, ascending numbers for each of {', '.join(METRIC_NAMES)}: angles from "
+    "0 to pi, lengths not below 0"
+)
 _CURE = "Fit the thresholds again, or take them from the model file as it was written"
 
 
@@ -108,9 +112,16 @@ class ShapeBins:
     """
 
     def __init__(self, thresholds: Mapping[str, Any]) -> None:
-        self._thresholds = {
-            str(token): _check(str(token), rows) for token, rows in thresholds.items()
-        }
+        self._thresholds = {token: np.array(rows, float) for token, rows in thresholds.items()}
+        for token, rows in self._thresholds.items():
+            if not (
+                rows.shape == (METRICS, INNER)
+                and np.isfinite(rows).all()
+                and (np.diff(rows) >= 0).all()
+                and rows.min() >= 0
+                and rows[ROW.A3].max() <= math.pi
+            ):
+                raise OptionError(f"the shape thresholds of '{token}' {_WRONG}", cure=_CURE)
 
     @classmethod
     def fit(cls, values: Mapping[str, np.ndarray]) -> ShapeBins:
@@ -139,14 +150,13 @@ class ShapeBins:
 
     def thresholds(self, token: str) -> np.ndarray:
         """Return thresholds (METRICS, INNER) float64 of one neighborhood, in radians and meters."""
-        try:
-            return self._thresholds[token].copy()
-        except KeyError:
+        if token not in self._thresholds:
             raise OptionError(
                 f"there are no shape thresholds for the neighborhood '{token}'",
                 found=", ".join(self._thresholds) or "none at all",
                 cure="Fit them for the same neighborhoods that are computed",
-            ) from None
+            )
+        return self._thresholds[token].copy()
 
     def comparable(self, token: str) -> np.ndarray:
         """Return thresholds as the kernels compare them: (METRICS, INNER) float32."""
@@ -156,9 +166,7 @@ class ShapeBins:
     def to_dict(self) -> dict[str, Any]:
         """Return ``{"c1": {"A3": [INNER numbers], "D1": ...}, ...}``, JSON-able and exact."""
         return {
-            token: {
-                name: [float(v) for v in row] for name, row in zip(METRIC_NAMES, rows, strict=True)
-            }
+            token: dict(zip(METRIC_NAMES, rows.tolist(), strict=True))
             for token, rows in self._thresholds.items()
         }
 
@@ -166,39 +174,13 @@ class ShapeBins:
     def from_dict(cls, data: Mapping[str, Any]) -> ShapeBins:
         """Return the bins that :meth:`to_dict` described; OptionError for another description."""
         try:
-            rows = {token: [each[name] for name in METRIC_NAMES] for token, each in data.items()}
-        except (AttributeError, KeyError, TypeError):
-            raise OptionError(
-                f"shape thresholds must be those of {', '.join(METRIC_NAMES)} of each neighborhood",
-                found=repr(data)[:80],
-                cure=_CURE,
-            ) from None
-        return cls(rows)
+            return cls({t: [rows[name] for name in METRIC_NAMES] for t, rows in data.items()})
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise OptionError(f"shape thresholds {_WRONG}", cure=_CURE) from None
 
     def __eq__(self, other: object) -> bool:
         """Return whether all thresholds are equal."""
         return isinstance(other, ShapeBins) and self.to_dict() == other.to_dict()
-
-
-def _check(token: str, rows: Any) -> np.ndarray:
-    """Return thresholds as an array (METRICS, INNER); OptionError where they cannot be."""
-    try:
-        array = np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    top = np.array([[math.pi if name == "A3" else math.inf] for name in METRIC_NAMES])
-    if array.shape != (METRICS, INNER) or not (
-        np.isfinite(array).all()
-        and (np.diff(array) >= 0).all()
-        and (array >= 0).all()
-        and (array <= top).all()
-    ):
-        raise OptionError(
-            f"the shape thresholds of '{token}' must be {INNER} finite, ascending numbers for each "
-            f"of {', '.join(METRIC_NAMES)}: angles from 0 to pi, lengths not below 0",
-            cure=_CURE,
-        )
-    return array
 
 
 class Work(NamedTuple):
@@ -277,8 +259,37 @@ class NeighborhoodGroup:
         counts = np.empty(FEATURES, np.float32)
         return Shapes(shaped, features, thresholds, seeds, values, counts, make_work())
 
-    def measure_shapes(self, points: Axes, shapes: Shapes, fitted: Fitted) -> None:
-        """Write the metrics of all pulls into `shapes`."""
+    def fill(
+        self,
+        points: Axes,
+        copies: np.ndarray,
+        fitted: Fitted,
+        shapes: Shapes | None,
+        out: np.ndarray,
+    ) -> tuple[dict[str, int], dict[str, int], float]:
+        """Compute the columns of these neighborhoods for a block of queries.
+
+        Parameters
+        ----------
+        points : (x, y, z), (m,) float64 each
+            Queries, neighbors at best, those of one cell of the grid one after the other.
+        copies : (m,) int64
+            How many of the user's queries each one stands for.
+        fitted : Fitted
+        shapes : Shapes or None
+            See :meth:`shapes`.
+        out : (m, F) float32
+
+        Returns
+        -------
+        few : dict
+            By token, numbers of queries with fewer than three points.
+        far : dict
+            By token, numbers of queries whose result depends on points farther than the plan's
+            halo, where there are any.
+        reach : float
+            Meters to the farthest point that matters to neighborhoods without a fixed radius.
+        """
         raise NotImplementedError
 
     def shape_values(self, points: Axes, fitted: Fitted) -> dict[str, np.ndarray]:
@@ -286,12 +297,13 @@ class NeighborhoodGroup:
 
         `fitted` has no bins.
         """
-        shapes = self.shapes(points, fitted)
+        shapes, m = self.shapes(points, fitted), len(points[0])
         if shapes is None:
             return {}
-        self.measure_shapes(points, shapes, fitted)
-        shaped = [k for k, columns in enumerate(self.chosen) if columns.shapes]
-        return {self.tokens[k]: shapes.values[k] for k in shaped}
+        width = 1 + max(max(columns.at.values()) for columns in self.chosen)
+        scratch = np.empty((m, width), np.float32)
+        self.fill(points, np.ones(m, np.int64), fitted, shapes, scratch)
+        return {self.tokens[k]: shapes.values[k] for k in np.flatnonzero(shapes.shaped)}
 
 
 def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: str) -> np.ndarray:
