@@ -59,11 +59,9 @@ def test_the_surface_is_that_of_the_ground_that_is_given(name):
         np.abs(result["HeightAboveGround"][ground]), 99
     )
     assert not known["Ground"][far_from(xyz, ground) & ~ground].any()
-    for opening in (
-        "HeightAboveOpening_5",
-        "HeightAboveOpening_17",
-    ):  # of all points, ground or not
-        assert np.array_equal(known[opening], result[opening])
+    for window in (5, 17):  # of all points, ground or not
+        name = f"HeightAboveOpening_{window}"
+        assert np.array_equal(known[name], result[name])
     assert figures["ground_points"] == np.count_nonzero(known["Ground"])
 
 
@@ -140,15 +138,6 @@ def test_without_ground_there_is_none_to_take(tmp_path, capsys):
     words = ["classify", str(tmp_path / "none.laz"), str(tmp_path / "o.laz"), "--ground", "given"]
     assert main(words) == 1
     assert "none of the points has class 2" in capsys.readouterr().err
-
-
-@pytest.mark.pdal
-def test_the_shipped_model_after_heights_of_pdal(edited, tmp_path):
-    """What they do not make is named, with the stage that takes their ground."""
-    nearest = {"type": "filters.hag_nn"}
-    apply = {"type": "filters.modelclassifier", "model": "standard"}
-    with pytest.raises(StageError, match=r"'Ground' is missing.*\n?.*filters\.hag_morphological"):
-        ps.run_pipeline([str(edited), nearest, apply, str(tmp_path / "out.laz")])
 
 
 @pytest.mark.pdal
