@@ -37,21 +37,6 @@ def test_every_run_line_is_one_step_of_the_script_and_every_step_is_run():
     assert os.access(SCRIPT, os.X_OK)
 
 
-def test_what_the_build_needs_is_sent_to_it():
-    lines = (ROOT / ".dockerignore").read_text().splitlines()
-    assert "*" in lines
-    sent = {line[1:] for line in lines if line.startswith("!")}
-    assert all((ROOT / name).exists() for name in sent)
-    copied = {rest.split()[0] for word, rest in instructions() if word == "COPY"} - {
-        ".",
-        "--from=build",
-    }
-    setup = re.search(
-        r"^    cat (pyproject.*)$", (ROOT / "scripts/setup").read_text(), re.MULTILINE
-    )[1].split()
-    assert copied | {name.split("/")[0] for name in setup} | {"pdal_stages"} <= sent
-
-
 # ---- starting ----------------------------------------------------------------------------------------------------
 
 

@@ -49,28 +49,14 @@ TILES = {
     "resumed": ["--tile", "30", "--workers", "0"],
 }
 VALUES = {
-    "input": ["las 1.2", "las 1.4", "laz 1.4", "copc", "feet", "several", "gaps", "noise unlabeled"],
+    "input": ["las 1.2", "las 1.4", "laz 1.4", "copc", "several"],
     "door": ["classify", "pipeline"],
-    "model": ["standard", "one pass", "two passes", "binary", "network"],
+    "model": ["standard", "one pass", "two passes", "network"],
     "tiles": list(TILES),
     "option": list(OPTIONS),
     "writer": list(WRITERS),
 }  # fmt: skip
-FEET = (
-    'PROJCS["UTM 32N in feet",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
-    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
-    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],'
-    'PARAMETER["false_easting",1640416.67],PARAMETER["false_northing",0],UNIT["foot",0.3048]]'
-)
-
-
-def possible(values) -> bool:
-    """Heights of vegetation are refused for a model that tells buildings alone."""
-    row = dict(zip(VALUES, values, strict=False))
-    return (row.get("model"), row.get("option")) != ("binary", "vegetation_heights")
-
-
-ROWS = [tuple(row) for row in allpairs(list(VALUES.values()), filter_func=possible)]
+ROWS = [tuple(row) for row in allpairs(list(VALUES.values()))]
 
 
 @pytest.fixture(scope="session")
@@ -89,12 +75,7 @@ def scenes(tmp_path_factory, write_las):
         "Withheld": (rng.random(n) < 0.03).astype(np.uint8),
         "Synthetic": (rng.random(n) < 0.1).astype(np.uint8),
     }  # fmt: skip
-    x, y = arrays["X"] - 500_000, arrays["Y"] - 5_400_000
-    lost = rng.integers(0, n, 40)
-    noisy = {name: np.concatenate([values, values[lost]]) for name, values in arrays.items()}
-    noisy["Z"][n:] += rng.choice([-30.0, 40.0], 40)
-    noisy["Classification"][n:] = 1
-    feet = {name: values / 0.3048 if name in "XYZ" else values for name, values in arrays.items()}
+    x = arrays["X"] - 500_000
     plain, modern = {"point_format": 1}, {"point_format": 6}
 
     def part(mask):
@@ -106,10 +87,7 @@ def scenes(tmp_path_factory, write_las):
         "laz 1.4": [write_las(folder / "new.laz", arrays, **modern)],
         # made by tests/data/make_copc.py of commit b10145c
         "copc": [Path(__file__).parent / "data" / "town.copc.laz"],
-        "feet": [write_las(folder / "feet.laz", feet, wkt=FEET, minor_version=4, **modern)],
         "several": [write_las(folder / f"p{k}.laz", part((x > 25) == k), **plain) for k in (0, 1)],
-        "gaps": [write_las(folder / "gaps.laz", part((x < 12) | (x > 38) | (y < 10)), **modern)],
-        "noise unlabeled": [write_las(folder / "noise.laz", noisy, **plain)],
     }
 
 
@@ -123,7 +101,6 @@ def models(tmp_path_factory, write_las):
     for name, more in {
         "one pass": {"passes": 1},
         "two passes": {"passes": 2},
-        "binary": {"passes": 1, "target": 6},
     }.items():
         paths[name] = str(folder / f"{name.replace(' ', '-')}.model")
         train = {
@@ -180,8 +157,6 @@ def stages(model, row):
 def command_of(row, files, model, folder):
     """The words of the row's command."""
     writer, words = WRITERS[row["writer"]], list(TILES[row["tiles"]])
-    if row["input"] == "feet" and words:
-        words[1] = "100"
     names = "o_#" if words or (len(files) > 1 and row["door"] == "classify") else "o"
     target = str(folder / f"{names}.{SUFFIXES[row['writer']]}")
     if row["door"] == "pipeline":

@@ -168,10 +168,7 @@ def _check_values(stage: Any, where: str) -> None:
         raise PipelineError(what, where=where, found=error, cure=cure) from None
     except (TypeError, ValueError, RecursionError) as error:
         what = "a stage holds a value that PDAL cannot take"
-        cure = (
-            "If it is a file's name, rename the file" if isinstance(error, UnicodeError) else None
-        )
-        raise PipelineError(what, where=where, found=error, cure=cure) from None
+        raise PipelineError(what, where=where, found=error) from None
 
 
 # The closing quote is optional, so that a match never fails: searching stays linear whatever the
