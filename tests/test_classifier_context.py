@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.context_features import OWN, WHOLE, Context, count_shares, rows_needed
 
+KINDS = ["even", "copies", "corners", "far"]
 TOKENS = ("own", "box0.5", "box1", "column2", "columnvotes4", "boxvotes1", "column0.125")
 
 
@@ -43,11 +44,7 @@ def cloud(seed, n, kind="even"):
 
 
 @settings(max_examples=10, deadline=None)
-@given(
-    st.integers(0, 10**6),
-    st.sampled_from([1, 7, 200]),
-    st.sampled_from(["even", "copies", "corners", "far"]),
-)
+@given(st.integers(0, 10**6), st.sampled_from([1, 7, 200]), st.sampled_from(KINDS))
 def test_equals_the_reference(seed, n, kind):
     xyz, shares = cloud(seed, n, kind)
     context = Context(TOKENS)

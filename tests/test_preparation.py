@@ -54,12 +54,9 @@ def test_one_spelling():
     ("stage", "says"),
     [
         ({"type": "filters.python", "source": "x"}, "filters.python"),
-        ({"type": "readers.las", "filename": "x"}, "readers.las"),
         ({"type": "filters.multiscalefeatures"}, "filters.multiscalefeatures"),
-        ({"type": "filters.accuracy"}, "filters.accuracy"),
         ({"type": "filters.modelclassifier", "model": "x"}, "filters.modelclassifier"),
         ({"type": "filters.smrf", "dir": "/tmp"}, "'dir'"),
-        ({"type": "filters.smrf", "log": "/tmp/x"}, "'log'"),
         ({"type": "filters.smrf", "where": "Z > 1"}, "'where'"),
         ({"type": "filters.smrf", "ignore": "/etc/passwd"}, "'ignore'"),
         ({"type": "filters.smrf", "cell": 1e-9}, "0.2 to 100"),
@@ -68,12 +65,8 @@ def test_one_spelling():
         ({**HAG, "cell": True}, "must be a number"),
         ({**HAG, "cell": 10**400}, "must be a number"),
         ({**HAG, "option_file": "/etc/passwd"}, "'option_file'"),
-        ({**HAG, "threads": 999}, "'threads'"),
-        ({**HAG, "user_data": "x"}, "'user_data'"),
-        ({**HAG, "inputs": ["x"]}, "'inputs'"),
         ({**HAG, "horizontal_unit": "foot"}, "'horizontal_unit'"),
         ({**HAG, "cell": "1;2"}, "'cell'"),
-        ({**HAG, "cell": {}}, "'cell'"),
         ({**HAG, "openings": [5] * 1000}, "2000 characters"),
         ({**HAG, "openings": [[5]]}, "'openings'"),
         ({**HAG, "where": "__import__('os')"}, "'where'"),
@@ -96,15 +89,8 @@ _JSON = st.recursive(
     max_leaves=8,
 )
 _KINDS = [*stage_types(), *PDAL_OPTIONS, "filters.python", "filters.stats", "filters.head"]
-_NAMES = [
-    *{name for names in CARRIED.values() for name in names},
-    "log",
-    "dir",
-    "source",
-    "json",
-    "user_data",
-    "tag",
-]
+_OTHERS = ("log", "dir", "source", "json", "user_data", "tag")
+_NAMES = [*{name for names in CARRIED.values() for name in names}, *_OTHERS]
 
 
 @settings(max_examples=150, deadline=None)

@@ -58,11 +58,8 @@ def test_order_and_stray_points_play_no_part():
     order = np.random.default_rng(1).permutation(len(xyz))
     assert np.array_equal(columns_of(xyz[order], shares[order], height[order]), expected[order])
     strays = np.array([[1e11, -1e11, 5.0], [-1e11, 1e11, 5.0]])
-    more = [
-        np.concatenate([array, end])
-        for array, end in ((xyz, strays), (shares, shares[:2]), (height, height[:2]))
-    ]
-    assert np.array_equal(columns_of(*more)[:-2], expected)
+    ends = ((xyz, strays), (shares, shares[:2]), (height, height[:2]))
+    assert np.array_equal(columns_of(*map(np.concatenate, ends))[:-2], expected)
 
 
 @pytest.mark.parametrize("seed", range(4))
