@@ -13,9 +13,6 @@ from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.base.errors import StageError
 from pdal_stages.objects.cells import Kind, object_id
 from pdal_stages.objects.crowns import crown_cells
-from pdal_stages.objects.raster_view import fill_gaps
-from pdal_stages.synthetic.blocks import TownBlock
-from pdal_stages.synthetic.town import ORIGIN, TURN, FlownTown
 
 
 def house(x0, y0, x1, y1, z, step=0.3, code=6):
@@ -75,19 +72,6 @@ def test_records_do_not_depend_on_order_or_parts(seed, parts):
     np.testing.assert_array_equal(joined.key, whole.key)
     for name in whole.columns:
         np.testing.assert_array_equal(joined.columns[name], whole.columns[name])
-
-
-def test_gaps_of_the_ground_continue_a_slope():
-    r, c = np.mgrid[:40, :60]
-    z = 0.3 * r - 0.2 * c + 5.0
-    holed = z.copy()
-    holed[12:28, 20:41] = np.nan
-    np.testing.assert_allclose(fill_gaps(holed, 60), z, atol=0.35)
-    row = holed.copy()
-    row[:, :] = np.nan
-    row[20, 0], row[20, 59] = 1.0, 60.0
-    np.testing.assert_allclose(fill_gaps(row, 60)[20], np.arange(1.0, 61.0), atol=1e-9)
-    assert np.isnan(fill_gaps(row, 10)[20, 30])
 
 
 def test_a_house_is_measured():
@@ -233,36 +217,6 @@ def test_a_shift_by_whole_cells_shifts_the_objects(town):
         for part, twin in zip(a.cells, b.cells, strict=True):
             np.testing.assert_array_equal(part[0] - 1024, twin[0])
         np.testing.assert_array_equal(a.columns["area"], b.columns["area"])
-
-
-def test_the_town(town):
-    """Objects of a generated town are detected: most buildings at IoU 0.5, most crowns have a tree within 4 m."""
-    shapely = pytest.importorskip("shapely")
-    got = found_in(town.xyz, town.classification)
-    table = got.tables[Kind.BUILDING]
-    houses, tops = [], []
-    for solid in (s for i, j in FlownTown(150.0, 4, 0.0).aimed for s in TownBlock(4, i, j).solids):
-        u, v = solid.middle
-        a, b = solid.half
-        corners = np.array([(u - a, v - b), (u + a, v - b), (u + a, v + b), (u - a, v + b)])
-        corners = corners @ TURN.T + ORIGIN[:2]
-        if solid.code == 6:
-            houses.append(shapely.Polygon(corners))
-        elif solid.shape == "ball" and solid.high - solid.low > 3.0:
-            tops.append((*corners.mean(axis=0), solid.high))
-    square = shapely.box(500_000, 5_400_000, 500_150, 5_400_150)
-    whole = shapely.union_all(houses).buffer(0.3).buffer(-0.3).intersection(square)
-    blocks = [g for g in shapely.get_parts(whole) if g.area > 4]
-    hit = 0
-    for n in range(len(table)):
-        row, column, _ = table.cells[n]
-        shape = shapely.union_all(shapely.box(column / 2, row / 2, column / 2 + 0.5, row / 2 + 0.5))
-        hit += any(shape.intersection(g).area / shape.union(g).area >= 0.5 for g in blocks)
-    assert hit >= 0.93 * max(len(blocks), len(table))
-    found = got.tables[Kind.TREE].columns
-    inside = [t for t in tops if square.contains(shapely.Point(t[:2]))]
-    near = [(np.hypot(found["x"] - x, found["y"] - y) < 4).any() for x, y, _ in inside]
-    assert len(near) > 20 and np.mean(near) > 0.8
 
 
 def test_far_points_cost_nothing():

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 from pdal_stages.base.asprs import class_color
 from pdal_stages.base.errors import StageError
@@ -19,7 +16,6 @@ from pdal_stages.reports.pictures import (
     WRONG,
     error_colors,
     paint,
-    png,
     shading,
     surface,
     triptych,
@@ -40,21 +36,6 @@ def block(n=40, step=0.5):
     """A full grid of points, n x n."""
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     return (i.ravel() + 0.5) * step, (j.ravel() + 0.5) * step, np.zeros(n * n)
-
-
-def pixels(data: bytes) -> np.ndarray:
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-
-
-def test_a_palette_is_close_and_keeps_rare_colors():
-    shades = np.zeros((256, 256, 3), np.uint8)
-    shades[..., 0] = np.arange(256)
-    shades[..., 1] = np.arange(256)[:, None] // 64
-    shades[7, 7] = (0, 0, 255)
-    assert np.abs(pixels(png(shades)).astype(int) - shades).max() <= 4
-    noise = np.random.default_rng(0).integers(0, 256, (300, 200, 3), dtype=np.uint8)
-    assert np.abs(pixels(png(noise)).astype(int) - noise).max() <= 64
-    assert np.array_equal(pixels(png(shades[:8, :8])), shades[:8, :8])
 
 
 def test_north_is_up_and_east_is_right():

@@ -98,34 +98,9 @@ def test_labels_and_heights_agree(town):
     assert h[c == 14].min() > 3
 
 
-def test_beams_pass_canopies_and_meet_walls(town):
-    share = np.bincount(town.number_of_returns) / len(town)
-    assert 0.55 < share[1] < 0.9 and share[2] > 0.05 and share[3] > 0.02 and share[5] > 0.002
-    tree = np.flatnonzero((town.return_number == 1) & (town.classification == 5))
-    last = tree + town.number_of_returns[tree] - 1
-    assert 0.15 < np.isin(town.classification[last], (2, 3)).mean() < 0.75, (
-        "ground is seen below trees"
-    )
-    cell = np.floor(town.xyz[town.classification == 6, :2] / 0.8).astype(np.int64)
-    _, which = np.unique(cell, axis=0, return_inverse=True)
-    low, high = np.full(which.max() + 1, np.inf), np.full(which.max() + 1, -np.inf)
-    np.minimum.at(low, which, town.z[town.classification == 6])
-    np.maximum.at(high, which, town.z[town.classification == 6])
-    assert ((high - low) > 3.0).mean() > 0.02, "facades are hit"
-
-
 def straight_down(places):
     zeros = np.zeros(len(places))
     return Pulses(places, np.zeros((len(places), 2)), zeros, zeros.astype(np.uint16), zeros)
-
-
-@pytest.mark.parametrize("extinction", [0.3, 1.0])
-def test_leaves_follow_beer_and_lambert(extinction):
-    rng = np.random.default_rng(0)
-    box = Solid("box", (0.0, 0.0), (30.0, 30.0), 30.0, 34.0, 5, 0.5, extinction)
-    returns = cast(straight_down(rng.uniform(-25, 25, (4000, 2))), [box], 1, rng)
-    met = np.unique(returns.pulse[returns.code == 5])
-    assert 1 - len(met) / 4000 == pytest.approx(math.exp(-4.0 * extinction), abs=0.03)
 
 
 def test_heights_of_roofs_balls_and_wires():

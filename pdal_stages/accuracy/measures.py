@@ -251,11 +251,6 @@ class Accuracy:
         """Return itself added to 0, which sum() starts with."""
         return self if other == 0 else NotImplemented
 
-    def __repr__(self) -> str:
-        """Return the number of points, the classes and the overall accuracy."""
-        what = f"overall_accuracy={self.overall_accuracy:.4f}" if self.points else "empty"
-        return f"<Accuracy of {self.points:,} points, classes {list(self.classes)}: {what}>"
-
     @property
     def columns(self) -> tuple[int, ...]:
         """Codes of the matrix's columns."""

@@ -15,11 +15,6 @@ from .cells import THOUSANDTHS
 #: Verdicts.
 SURE = "sure"
 CHECK = "check"
-#: Why an object is to be checked.
-REASONS = (
-    "no ground near", "small", "narrow", "low", "unsure points", "no facade",
-    "few points", "thin crown", "wide crown", "short", "not straight",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -33,13 +28,8 @@ class CheckRules:
     min_building_area: float = 10.0  #: sheds are kept, yet often something else
     min_building_width: float = 2.0  #: side of the square that it must hold; no wire or wall does
     min_building_height: float = 2.2  #: of the ridge: a door's height
-    facade_to_area: float = 50.0  #: larger buildings may hide their walls from the laser
-    min_facade: float = 1.5  #: height between points of a cell at the edge that shows a wall
     min_tree_points: int = 10
-    min_crown_ratio: float = 0.12  #: crown diameter / height
-    max_crown_ratio: float = 1.6  #: crown diameter / height
     min_span: float = 8.0
-    min_straightness: float = 0.9  #: distance between a span's ends / its length
     min_deck_area: float = 20.0
     min_deck_height: float = 0.5
 
@@ -101,7 +91,6 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
     above = cells.z - (np.nanmin(cells.low) if math.isnan(ground) else ground)
     edge = ~scipy.ndimage.binary_erosion(inside)[cells.place]
     square = np.ones((math.ceil(RULES.min_building_width / size),) * 2, bool)
-    facade = np.mean(np.nan_to_num(cells.z[edge] - cells.low[edge]) >= RULES.min_facade)
     ridge = float(np.percentile(above, RIDGE))
     return cells.describe(
         {
@@ -115,7 +104,6 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
             "small": area < RULES.min_building_area,
             "narrow": not scipy.ndimage.binary_erosion(inside, square).any(),
             "low": ridge < RULES.min_building_height,
-            "no facade": facade == 0 and area < RULES.facade_to_area,
         },
     )
 
@@ -137,8 +125,6 @@ def measure_tree(cells: ObjectCells, top_row: int, top_column: int, size: float)
         },
         {
             "few points": cells.points.sum() < RULES.min_tree_points,
-            "thin crown": diameter < RULES.min_crown_ratio * height,
-            "wide crown": diameter > RULES.max_crown_ratio * height,
         },
     )
 
@@ -149,7 +135,6 @@ def measure_span(cells: ObjectCells, size: float) -> dict[str, Any]:
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))]
     length, clearance = float(along[-1]), cells.low - cells.ground
     chord = np.interp(along, along[[0, -1]], path[[0, -1], 2])
-    straight = float(np.hypot(*(path[-1, :2] - path[0, :2])))
     return cells.describe(
         {
             "length": length,
@@ -160,7 +145,6 @@ def measure_span(cells: ObjectCells, size: float) -> dict[str, Any]:
         },
         {
             "short": length < RULES.min_span,
-            "not straight": straight < RULES.min_straightness * length,
         },
     )
 

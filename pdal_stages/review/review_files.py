@@ -146,11 +146,11 @@ def review_files(
     files = input_files(inputs)
     references = {path: reference_of_file(path) for path in files}
     print_messages(*check_one_reference(references))
-    side = cell or cell_side(*_points_and_area(files, references))
+    points, area = _points_and_area(files, references)
+    side = cell or cell_side(points, area)
     work = [(path, references[path].wkt, model, side, number) for number, path in enumerate(files)]
     parts = [part for cells in each_file(cells_of_file, work, workers) for part in cells]
-    headers = map(read_header, files)
-    if all(header is not None and not header.count for header in headers):
+    if not points:
         nothing = np.empty(0, np.uint8)
         parts = [ReviewCells.from_points(np.empty((0, 3)), nothing, nothing, side)]
     elif not any(map(len, parts)):
