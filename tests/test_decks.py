@@ -67,7 +67,7 @@ def test_roofs_and_ramps_are_no_decks(roof):
     def terrain(s, t):
         return 0.1 * np.sin(s / 9), np.full(len(s), 2)
 
-    assert not detect(scan(Scene(terrain, [roof], [], 0.2, 360.0, 120.0), 6.0)[0]).any()
+    assert not detect(scan(Scene(terrain, [roof], 0.2, 360.0, 120.0), 6.0)[0]).any()
 
 
 def test_what_lies_beyond_the_survey_is_no_drop():

@@ -13,7 +13,6 @@ FOLDER = Path(__file__).resolve().parent.parent / "benchmarks" / "papers"
 if str(FOLDER) not in sys.path:
     sys.path.insert(0, str(FOLDER))
 
-import b16_experiments  # noqa: E402
 import clouds  # noqa: E402
 import h17_oakland  # noqa: E402
 import kit  # noqa: E402
@@ -113,18 +112,6 @@ def scene(folder, tmp_path_factory):
     )
 
 
-def test_b16_names():
-    count = {
-        (hood, kind): len(b16_experiments.names_of(tokens, kind))
-        for hood, tokens in b16_experiments.NEIGHBORHOODS.items()
-        for kind in b16_experiments.SETS
-    }
-    assert count["c1", "measures"] == 13  # 12 and Z
-    assert count["c1", "distributions"] == 50
-    assert count["kopt", "both"] == 64
-    assert count["all", "both"] == 312  # 311 and Z
-
-
 def test_w18_run(scene):
     trainer = w18.Trainer(scene, trees=10, threads=1)
     full = trainer.run(100, 0)
@@ -160,38 +147,3 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     assert 0.05 < (part.curvature >= 0.05).mean() < 0.95
     shares = h17_oakland.shares(part.labels, part.curvature, 0.0)
     assert all(share["points"] == share["scattered"] for share in shares.values())
-
-
-def test_b16_command_on_pts_resumes(folder, tmp_path, monkeypatch, capsys):
-    """The command for clouds that cannot be had, on the stand-in; a second run does nothing again."""
-    monkeypatch.setattr(b16_experiments, "COUNT", 50)
-    monkeypatch.setattr(b16_experiments, "TREES", (3,))
-    monkeypatch.setattr(scenes, "NEIGHBORHOODS", "c1,c2,c3,c5,kopt")
-    words = [
-        "--data",
-        str(folder),
-        "--scene",
-        "town",
-        "--cache",
-        str(tmp_path / "cache"),
-        "--seeds",
-        "1",
-    ]
-    words += [
-        "--threads",
-        "1",
-        "--json",
-        str(tmp_path / "r.json"),
-        "--tables",
-        str(tmp_path / "t.md"),
-    ]
-    monkeypatch.setattr(sys, "argv", ["b16_experiments.py", *words])
-    b16_experiments.main()
-    first = json.loads((tmp_path / "r.json").read_text())
-    assert len(first["runs"]) == 21
-    assert first["machine"]["pdal_stages"]
-    assert "Kappa" in (tmp_path / "t.md").read_text()
-    capsys.readouterr()
-    b16_experiments.main()
-    assert json.loads((tmp_path / "r.json").read_text()) == first
-    assert '"neighborhood"' not in capsys.readouterr().err  # nothing was run
