@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import laspy
@@ -17,7 +14,6 @@ from block_scene import QUICK_TRAINING, ground_and_block
 from pdal_stages.base.errors import PipelineError
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
-from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.inputs_outputs import outputs_of
 
 pytestmark = pytest.mark.pdal
@@ -131,30 +127,6 @@ def test_metadata_of_many(folder, classify, tmp_path):
     assert data["outputs"][3]["state"] == "failed" and "bad.laz" in data["failures"][0]["what"]
 
 
-def test_an_interrupt_says_what_is_finished(folder, tmp_path, write_las):
-    """Each file is told of, and logged, as soon as it is there; the one under work when Ctrl-C comes leaves nothing."""
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(0, 400, (2, 300_000))
-    far = {"X": x + 5000, "Y": y + 5000, "Z": rng.normal(0, 0.1, len(x))}
-    slow = write_las(tmp_path / "z_slow.laz", far, point_format=1)
-    words = ["classify", folder / "in", slow, tmp_path / "out_#.laz", "--tile", 500]
-    words += ["--model", folder / "m.model", "--workers", 1, "--metadata", tmp_path / "m.json"]
-    command = [sys.executable, "-m", "pdal_stages.cli", *map(str, words)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, **pipes) as run:
-        seen = [run.stdout.readline() for _ in range(3)]
-        run.send_signal(signal.SIGINT)
-        _, err = run.communicate(timeout=60)
-    assert run.returncode == 130, err
-    written = [f"out_t{number}.laz" for number in range(3)]
-    assert sorted(Path(line.partition(":")[0]).name for line in seen) == written
-    assert all("500 points; " in line for line in seen), seen
-    assert "3 of 4 files written" in err and "--resume" in err, err
-    assert files_in(tmp_path, "*out_*") == written
-    assert '"waiting"' in (tmp_path / "m.json").read_text()
-    assert not list(tmp_path.glob(".pdal-stages-partial*"))
-
-
 def test_tiles_are_refused_where_nothing_can_be_cut(folder, classify, tmp_path):
     rows = laspy.read(folder / "in" / "t0.laz").xyz
     for number in range(2):
@@ -256,9 +228,3 @@ def test_points_beyond_the_box_of_the_header(folder, classify, tmp_path, tile):
     (tmp_path / "odd.laz").write_bytes(content)
     code, _, err = classify(tmp_path / "odd.laz", tmp_path / "out.laz", *tile)
     assert code == 0 and "odd.laz: points lie outside the bounding box in the header" in err, err
-
-
-def test_heights_of_vegetation_reach_the_classifier():
-    heights = {"vegetation_heights": "0.5,2"}
-    stages = {s["type"]: s for s in ClassifyRequest(classifier_options=heights).stages}
-    assert heights.items() <= stages["filters.modelclassifier"].items()

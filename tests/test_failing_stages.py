@@ -115,11 +115,7 @@ def test_stages_that_pdal_leaves_out(tmp_path, monkeypatch):
         {"type": "readers.text", "filename": str(text)},
         {"type": "filters.range", "limits": "Z[5:]"},
     ]
-    train = {
-        "type": "writers.classifiermodel",
-        "filename": str(tmp_path / "m"),
-        "feature_set": "covariance",
-    }
+    train = {"type": "writers.classifiermodel", "filename": str(tmp_path / "m")}
     for stop in (False, True):
         if stop:  # as if it had not been called
             monkeypatch.setattr(runtime, "_run_interruptible", lambda *_: None)
@@ -130,13 +126,4 @@ def test_stages_that_pdal_leaves_out(tmp_path, monkeypatch):
         with pytest.raises(ps.StageError, match=r"writers\.classifiermodel.*no points to train on"):
             ps.run_pipeline([*none, {"type": "filters.hag_minima"}, train])
         with pytest.raises(ps.StageError, match="no points to compare"):
-            ps.run_pipeline(
-                [
-                    *none,
-                    {
-                        "type": "filters.accuracy",
-                        "reference": "Classification",
-                        "dimension": "Classification",
-                    },
-                ]
-            )
+            ps.run_pipeline([*none, {"type": "filters.accuracy", "reference": "Classification"}])

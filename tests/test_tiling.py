@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import json
-
 import laspy
 import numpy as np
 import pytest
 import tiling_clouds as clouds
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from processes import printed
 
 import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, PipelineError, StageError
-from pdal_stages.pipeline.inputs_outputs import locations
 from pdal_stages.synthetic.town import WKT
 from pdal_stages.terrain.minima import terrain_reach
 from pdal_stages.tiling.classify import ClassifyTask
-from pdal_stages.tiling.inputs import CloudIndex, InputSource
-from pdal_stages.tiling.options import TileGrid
-from pdal_stages.tiling.sorted_points import cut_all, sort_points
 from pdal_stages.tiling.tiled_run import TilingOptions, run_tiled
 
 pytestmark = pytest.mark.pdal
@@ -61,42 +54,6 @@ def whole(tmp_path_factory, town_file, model_file):
 # ---- reading parts of files ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize("point_format", [1, 6])
-def test_a_cut_is_the_files_own_bytes(tmp_path, random_cloud, write_las, suffix, point_format):
-    xyz = random_cloud(120_000, seed=1, extent=(100, 100, 5))
-    xyz = xyz[np.argsort(xyz[:, 0], kind="stable")]  # so that blocks are compact
-    arrays = dict(zip("XYZ", xyz.T, strict=True)) | {
-        "Intensity": np.arange(len(xyz)) % 65536,
-        "Extra": xyz[:, 0],
-    }
-    path = write_las(
-        tmp_path / f"cloud{suffix}",
-        arrays,
-        point_format=point_format,
-        wkt=WKT if point_format == 6 else None,
-    )
-    grid = TileGrid(25.0)
-    index = CloudIndex.parse(
-        sort_points(str(path), grid, str(tmp_path / "copy")), str(tmp_path / "copy")
-    )
-    assert index.count == len(xyz) and sum(n for _, _, n in index.tiles) == len(xyz)
-    fine = sort_points(str(path), TileGrid(0.1), str(tmp_path / "fine"))
-    assert len(fine["tiles"]) > 0.5 * len(xyz)  # small tiles are no sign of damage
-    (piece,) = cut_all(grid, (1, 2), [InputSource(str(path), {}, index=index)], 3.0, str(tmp_path))
-    las, all_ = laspy.read(piece.path), laspy.read(path)
-    expected = np.flatnonzero(
-        (xyz[:, 0] >= 22) & (xyz[:, 0] <= 53) & (xyz[:, 1] >= 47) & (xyz[:, 1] <= 78)
-    )
-    assert np.array_equal(piece.index, expected)
-    assert las.points.array.tobytes() == all_.points.array[expected].tobytes()
-    core = ((xyz[expected, :2] >= (25, 50)) & (xyz[expected, :2] < (50, 75))).all(axis=1)
-    assert np.array_equal(piece.own_rows, np.flatnonzero(core))
-    assert [v.record_id for v in las.header.vlrs] == [
-        v.record_id for v in all_.header.vlrs if v.record_id != 22204
-    ]
-
-
 def test_pdals_filters_see_one_file_at_a_time(tmp_path, random_cloud, write_las):
     """As in a pipeline without tiles, until a stage of ours merges the files."""
     xyz = random_cloud(4_000, seed=2, extent=(40, 40, 3))
@@ -126,12 +83,6 @@ def test_a_small_survey_is_one_tile(tmp_path, random_cloud, write_las, corner):
     stages = [str(tmp_path / "?.las"), {"type": "filters.hag_minima", "cell": 3}]
     run = run_tiled([*stages, str(tmp_path / "o_#.las")], TilingOptions(workers=0), dry_run=True)
     assert len(run.tiles) == 1
-
-
-@pytest.mark.parametrize("side", [1e300, 1e308, 2e9])
-def test_a_side_larger_than_the_earth_is_refused(side):
-    with pytest.raises(OptionError, match="--tile must be a number above 0 and at most 1e"):
-        TilingOptions(tile=side)
 
 
 # ---- the same as untiled ---------------------------------------------------------------------------------
@@ -416,6 +367,7 @@ def test_global_stages_are_refused(tmp_path, town_file, stage, message):
     "change, message",
     [
         ({"tile": 0}, "above 0"),
+        ({"tile": 1e300}, "--tile must be a number above 0 and at most 1e"),
         ({"workers": 10_000}, "cores"),
         ({"workers": 1, "scheduler": "tcp://x:1"}, "one of them"),
         ({"per": "day"}, "one of"),
@@ -444,64 +396,6 @@ def test_outputs_need_names(tmp_path, town_file):
         )
     with pytest.raises(PipelineError, match="no file matches"):
         run_tiled([str(tmp_path / "none*.las"), str(tmp_path / "o_#.las")], 30)
-
-
-# ---- tile indexes --------------------------------------------------------------------------------
-
-
-def test_tile_indexes_are_read(tmp_path, town_file, pdal_program, model_file, whole):
-    for name, driver in (("b.gpkg", "GPKG"), ("d.geojson", "GeoJSON")):
-        printed(
-            pdal_program,
-            "tindex",
-            "create",
-            tmp_path / name,
-            town_file,
-            "-f",
-            driver,
-            "--fast_boundary",
-        )
-        assert locations(str(tmp_path / name)) == [str(town_file)]
-        with pytest.raises(StageError, match="cannot be read"):
-            locations(str(tmp_path / name), "nothing")
-    pipeline = clouds.stages([town_file], tmp_path / "out.laz", model_file)
-    pipeline[0] = {"type": "readers.tindex", "filename": str(tmp_path / "b.gpkg")}
-    assert not run_tiled(pipeline, 60, workers=0).failures
-    clouds.same_points(whole, tmp_path / "out.laz")
-
-
-# ---- telling ---------------------------------------------------------------------------------------------
-
-
-def test_reports(tmp_path, town_file, model_file):
-    """Both reports tell the same, the page is well-formed, and its map has a square for every tile."""
-
-    from pdal_stages.cli import main
-
-    job = tmp_path / "job.json"
-    broken = tmp_path / "broken_town.laz"
-    broken.write_bytes(b"LASF")
-    stages = clouds.stages([town_file, broken], tmp_path / "c_#.laz", model_file)
-    job.write_text(json.dumps(stages))
-    names = ["--report", str(tmp_path / "r.json")]
-    words = ["pipeline", str(job), "--tile", "45", "--workers", "0"]
-    assert main([*words, *names, "--dry-run"]) == 1  # an input cannot be read
-    assert not list(tmp_path.glob("c_*"))
-    dry = json.loads((tmp_path / "r.json").read_text())
-    assert dry["points"] == len(laspy.read(town_file)) and dry["disk_gb"] > 0
-    assert main([*words, *names, "--metadata", str(tmp_path / "run.metadata")]) == 1
-    assert json.loads((tmp_path / "run.metadata").read_text())["failures"]
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["states"]["failed"] == 0 and report["failures"][0]["what"] == str(broken)
-    assert (
-        sum(report["classes"].values())
-        == report["points"]
-        == len(laspy.read(tmp_path / "c_town.laz"))
-    )
-    assert sum(tile["points"] for tile in report["tiles"]) == report["points"]
-    assert main([*words, *names, "--resume"]) == 1
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["states"]["kept"] == len(report["tiles"])
 
 
 def test_outputs_of_tiles_hold_all_that_inputs_of_several_kinds_hold(tmp_path, write_las):

@@ -221,24 +221,6 @@ def test_resume_does_only_what_changed(tmp_path, expected, folder):
     assert again()["done"] == 8
 
 
-def test_an_edit_in_the_middle_of_an_input_is_noticed(tmp_path, write_las):
-    """Size, time and both ends stay the same; the height of one point does not."""
-    xyz = np.random.default_rng(0).uniform(0, 1, (8_000, 3)) * (40, 40, 5)
-    path = write_las(tmp_path / "in.las", dict(zip("XYZ", xyz.T, strict=True)), point_format=6)
-    writer = {"type": "writers.las", "filename": str(tmp_path / "o.las"), "forward": "all"}
-    stages = [str(path), {"type": "filters.hag_minima", "cell": 2}, writer]
-    run_tiled(stages, 20, workers=0)
-    status, las = path.stat(), laspy.read(path)
-    las.Z[4_000] += 10
-    data = bytearray(path.read_bytes())
-    data[las.header.offset_to_point_data : len(data)] = las.points.array.tobytes()
-    path.write_bytes(data)
-    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
-    assert path.stat().st_size == status.st_size
-    assert run_tiled(stages, 20, workers=0, resume=True).summary["states"]["done"] >= 1
-    assert laspy.read(tmp_path / "o.las").Z[4_000] == las.Z[4_000]
-
-
 # ---- people ----------------------------------------------------------------------------------------------
 
 

@@ -25,23 +25,6 @@ MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpeni
 SIDE, TILE = 460, 160
 
 
-@pytest.mark.parametrize("cell", [1.0, 0.7, 3.0])
-def test_the_lowest_points_of_cells(cell):
-    rng = np.random.default_rng(int(10 * cell))
-    x, y, z = np.round(rng.uniform(-40, 40, (3, 3000)), 1)
-    x[:5] += 1e7  # strays
-    z[7] = -1e7
-    use = rng.random(3000) < 0.9
-    lowest, _ = reduced_points(x, y, z, use, FilterOptions(cell=cell))
-    best: dict[tuple[int, int], tuple] = {}
-    for n in np.flatnonzero(use & (np.abs(z) < 1e6)):
-        key = (int(np.floor(x[n] / cell)), int(np.floor(y[n] / cell)))
-        best[key] = min(best.get(key, (np.inf,)), (z[n], x[n], y[n]))
-    assert {(z, x, y) for x, y, z in lowest} == set(best.values())
-    assert len(lowest) == len(best)
-    assert reduced_points(x, y, z, np.zeros(3000, bool), FilterOptions(cell=cell))[0].size == 0
-
-
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory, write_las):
     """Two files that adjoin, with noise that is ignored by its class and some that is not."""
@@ -225,8 +208,3 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         assert core.any()
         for name, values in subset.items():
             assert np.array_equal(values[core], whole[name][near][core]), (box, name)
-
-
-def test_a_block_without_points_has_no_cells():
-    none = cells_of_block(np.empty((0, 3)), (3, -4), FilterOptions(openings=(5,)))
-    assert none.cells["opened"].shape == (0, 1)

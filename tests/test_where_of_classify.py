@@ -97,13 +97,6 @@ def test_in_a_pipeline_each_where_sees_the_classes_of_its_place(tmp_path, run_jo
     assert not wires[WHERE[1]] and wires["Mine == 1"] > 100
 
 
-@pytest.mark.parametrize("mark", ["1st", "a b", "a-b"])
-def test_marks_that_are_no_names(run_job, tmp_path, mark):
-    stages = ["in.las", {"type": "filters.modelclassifier", "model": "standard", "mark": mark}]
-    code, _, err = run_job([*stages, tmp_path / "out.las"])
-    assert code == 1 and "option 'mark' must be a name" in err
-
-
 # ---- overlap -----------------------------------------------------------------------------------------------
 
 
