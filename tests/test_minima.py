@@ -55,16 +55,6 @@ def test_equals_the_slow_reference(seed, offset):
     assert np.allclose(got, slow_hag(x, y, z, 20.0, 0.5), atol=1e-9 * max(1, abs(offset) / 1e4))
 
 
-def test_one_stray_point_costs_one_cell():
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(0, 100, (2, 1000))
-    z = rng.normal(0, 1, 1000)
-    figures = {}
-    both = hag_minima(np.append(x, 1e9), np.append(y, -1e9), np.append(z, 7.0), figures=figures)
-    assert figures["cells"] == 26
-    assert np.array_equal(both, np.append(hag_minima(x, y, z), 0.0))
-
-
 def test_gaps_are_filled_and_counted():
     x, z, figures = [1.0, 201.0, 100.0, 55.0], [0.0, 10.0, 50.0, 0.0], {}
     forms = [True, True, True, False]

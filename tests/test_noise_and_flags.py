@@ -90,22 +90,6 @@ def test_old_and_new_files_together(tmp_path, run_job, write_las, wiring):
     assert not list(written.point_format.extra_dimension_names)
 
 
-def test_training_on_old_and_new_files(tmp_path, run, write_las):
-    """Withheld points teach nothing, of either kind."""
-    models = []
-    for point_formats in ((1, 6), (6, 6)):
-        files = [
-            write_las(tmp_path / f"{n}.las", flagged(n), point_format=point_formats[n])
-            for n in (0, 1)
-        ]
-        few = {"neighborhoods": "k8", "count": 50, "trees": 2, "passes": 1, "threads": 1}
-        words = [f"--writers.classifiermodel.{name}={value}" for name, value in few.items()]
-        code, _, err = run("train", *files, "--model", tmp_path / "m.model", *words)
-        assert code == 0, err
-        models.append(ps.load_model(tmp_path / "m.model").passes[0].arrays())
-    assert all(np.array_equal(models[0][key], models[1][key]) for key in models[0])
-
-
 def test_where_sees_classes_without_flags(write_las, tmp_path, model):
     """Of LAS 1.2 as of LAS 1.4."""
     classes = []
@@ -128,27 +112,6 @@ def test_writers_of_both_are_refused_before_work(tmp_path, run_job, write_las, m
     assert code == 1 and "flags" in err and "dataformat_id" in err
     assert run_job([old, {**new, "filename": str(tmp_path / "c.las"), "forward": "all"}])[0] == 0
     assert np.array_equal(all_flags(laspy.read(old)), all_flags(laspy.read(tmp_path / "c.las")))
-
-
-@pytest.mark.parametrize("tiles", [False, True])
-def test_all_extra_dimensions_of_a_new_file(tmp_path, run_job, write_las, tiles):
-    extra = np.arange(900)
-    arrays = flagged() | {"Amplitude": extra.astype("f4"), "Linearity": extra.astype("f8")}
-    source = write_las(tmp_path / "in.laz", arrays, point_format=7)
-    stages = [
-        str(source),
-        {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
-        {"type": "filters.hag_minima"},
-        {"type": "writers.las", "filename": str(tmp_path / "o.las"), "extra_dims": "all", **NEWER},
-    ]
-    code, _, err = run_job(stages, *(["--tile", 20, "--workers", 0] if tiles else []))
-    assert code == 0, err
-    written = laspy.read(tmp_path / "o.las")
-    names = set(written.point_format.extra_dimension_names) - {"ClassFlags"}  # of old PDAL
-    ours = {"Amplitude", "Linearity", "Reference", "HeightAboveGround"}
-    assert names == ours | {"Red", "Green", "Blue"}
-    assert np.array_equal(written.Amplitude, arrays["Amplitude"])
-    assert np.array_equal(all_flags(laspy.read(source)), all_flags(written))
 
 
 def test_kept_codes_that_do_not_fit_are_refused(tmp_path, run, write_las, model):
@@ -211,7 +174,8 @@ def test_overlap_is_a_neighbor_and_keeps_its_class(tmp_path, run, write_las, mod
     assert (np.asarray(out.classification) == truth).mean() > 0.9
 
 
-def test_features_and_training_without_unwanted_points(tmp_path, capsys, write_las):
+@pytest.mark.parametrize("point_format", [1, 6])
+def test_features_and_training_without_unwanted_points(tmp_path, write_las, point_format):
     clean = ground_and_block(300)
     bad = {name: np.concatenate([v, v[:60]]) for name, v in clean.items()}
     bad["Z"][300:] += 1.0
@@ -219,7 +183,7 @@ def test_features_and_training_without_unwanted_points(tmp_path, capsys, write_l
     bad["Withheld"] = np.repeat([0, 1], [330, 30]).astype(np.uint8)
     features, models = [], []
     for name, arrays in (("clean", clean), ("bad", bad)):
-        source = write_las(tmp_path / f"{name}.las", arrays, point_format=6)
+        source = write_las(tmp_path / f"{name}.las", arrays, point_format=point_format)
         planarity = {"neighborhoods": "k5", "feature_set": "covariance"}
         job = ps.run_pipeline([str(source), {"type": "filters.multiscalefeatures", **planarity}])
         features.append(job.arrays[0]["Planarity_k5"])
