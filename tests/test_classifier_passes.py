@@ -82,9 +82,8 @@ def test_equals_passes_by_hand(two, other):
     p = second.forest.predict_proba(np.hstack([values[rows], columns]))
     p = p * two.factors
     p /= p.sum(axis=1, keepdims=True)
-    assert np.array_equal(
-        everything(two, xyz, dimensions).probabilities[rows], p.astype(np.float32)
-    )
+    ours = everything(two, xyz, dimensions).probabilities[rows]
+    assert np.array_equal(ours, p.astype(np.float32))
 
 
 def test_blocks_threads_memory_and_order_change_nothing(two, other):
@@ -134,9 +133,8 @@ def test_training_depends_on_nothing_but_the_points(two, tmp_path):
     xyz, label, dimensions = scene()
     p = np.random.default_rng(1).permutation(len(xyz))
     cloud = TrainingCloud(xyz[p], label[p], {k: v[p] for k, v in dimensions.items()}, "a.laz")
-    again = train(
-        [cloud], TrainingOptions(**FEW, passes=2, threads=3, memory_mb=40), progress=False
-    )
+    options = TrainingOptions(**FEW, passes=2, threads=3, memory_mb=40)
+    again = train([cloud], options, progress=False)
     two.save(tmp_path / "m")
     again.save(tmp_path / "n")
     assert (tmp_path / "m").read_bytes() == (tmp_path / "n").read_bytes()

@@ -15,7 +15,7 @@ from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.model_file import STANDARD, shipped
 from pdal_stages.cli import main
 from pdal_stages.pipeline.run import Pipeline
-from pdal_stages.stages.preprocessing import made_of_coordinates, preparation_of
+from pdal_stages.stages.preprocessing import made_of_coordinates
 
 
 def test_every_shipped_model_loads_says_its_preparation_and_is_small(tmp_path):
@@ -106,16 +106,6 @@ def test_training_keeps_the_stages_before_it(ready_town, tmp_path):
     expanded = json.loads(Pipeline([str(ready_town), heights, {**writer, **few}]).json)
     arguments = expanded["pipeline"][-1]["pdalargs"]
     assert arguments["preparation"] == [{"type": "filters.hag_minima", "cell": 10}]
-
-
-def test_heights_follow_from_what_is_read():
-    assert preparation_of(["X", "Intensity"]) == []
-    assert preparation_of(["HeightAboveOpening_x"]) == []
-    assert preparation_of(["HeightAboveOpening_2_5"])[0]["openings"] == [2.5]
-    assert preparation_of(["HeightAboveGround"]) == [{"type": "filters.hag_minima"}]
-    assert preparation_of(["Ground", "HeightAboveOpening_17", "HeightAboveOpening_5"]) == [
-        {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
-    ]
 
 
 @pytest.mark.pdal

@@ -19,17 +19,8 @@ from pdal_stages.classifier.training_options import (
 from pdal_stages.features import FeaturePlan
 from pdal_stages.stages.registry import stage_from
 
-#: What the texts say, by recipe: [B16 3.1, 3.2.1, 4.2], [W18 3.1, 3.2, 4.3], [H17 2.2, 2.3, 3.1], [WM19 4.1].
-TEXTS = {
-    "blomley2016": {"count": 1000, "features": 312, "scaling": "percentiles", "vote": "majority"},
-    "weinmann2018": {
-        "count": 100_000,
-        "features": 560,
-        "scaling": "percentiles",
-        "vote": "majority",
-    },
-    "he2017": {"count": 1000, "features": 6, "trees": 200, "max_depth": "sqrt"},
-}
+#: Features of a recipe, by the texts: [B16 3.1, 3.2.1], [W18 3.1, 3.2], [H17 2.2].
+FEATURES = {"blomley2016": 312, "weinmann2018": 560, "he2017": 6}
 
 
 def growth(**options):
@@ -37,16 +28,9 @@ def growth(**options):
     return TrainingOptions(**{"min_samples_leaf": 1, "max_samples": 1.0, **options})
 
 
-EVERYWHERE = {"sampling": "random", "passes": 1, "voxel": 0.0, "prior_weight": 0.0}
-
-
-@pytest.mark.parametrize("name", TEXTS)
-def test_a_recipe_is_what_the_text_says(name):
-    options = TrainingOptions(**RECIPES[name])
-    wanted = {**EVERYWHERE, **TEXTS[name]}
-    assert len(feature_plan(options).names) == wanted.pop("features")
-    assert {key: getattr(options, key) for key in wanted} == wanted
-    assert not options.trees_grid or name == "blomley2016"
+@pytest.mark.parametrize("name", FEATURES)
+def test_a_recipe_has_as_many_features_as_the_text_says(name):
+    assert len(feature_plan(TrainingOptions(**RECIPES[name])).names) == FEATURES[name]
 
 
 def test_the_networks_recipe():
