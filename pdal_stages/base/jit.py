@@ -34,7 +34,6 @@ _DIVISION = {"error_model": "numpy"}
 _functions: dict[Any, Callable] = {}
 
 _lock = threading.RLock()
-_told_uncached: set[str] = set()
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -176,14 +175,13 @@ def _careful(file: Any, act: Callable) -> Callable:
     return attempt
 
 
+@lru_cache(maxsize=1)
 def _tell_uncached(folder: str) -> None:
     """Warn, once in a process, that kernels are compiled at each start, and why."""
-    if not _told_uncached:
-        _told_uncached.add(folder)
-        print_messages(
-            f"compiled code is not kept, as other users can write to {folder}: every start "
-            "compiles again. Set NUMBA_CACHE_DIR to a folder of your own"
-        )
+    print_messages(
+        f"compiled code is not kept, as other users can write to {folder}: every start compiles "
+        "again. Set NUMBA_CACHE_DIR to a folder of your own"
+    )
 
 
 @lru_cache(maxsize=256)

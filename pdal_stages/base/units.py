@@ -141,11 +141,7 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
     centered = geodetic.keyword == "GEOCCS" or (
         system is not None and system.name.lower() == "cartesian"
     )
-    zone = utm_code(*place) if place is not None and not centered else None
-    code = f"EPSG:{zone or 'CODE'}"
-    what = "the UTM zone of the points; or use the national grid of the area"
-    if not zone:
-        what = "with the UTM zone or national grid of the area as CODE"
+    code = f"EPSG:{(place and not centered and utm_code(*place)) or 'CODE'}"
     raise StageError(
         "the coordinates are geocentric (from the earth's center); heights need a vertical axis"
         if centered
@@ -154,7 +150,7 @@ def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) ->
         cure="Add a reprojection before this stage, "
         f'{{"type": "filters.reprojection", "out_srs": "{code}"}}, or '
         "reproject the files first, pdal translate IN OUT reprojection "
-        f"--filters.reprojection.out_srs={code} ({what})",
+        f"--filters.reprojection.out_srs={code} (a UTM zone, or the national grid of the area)",
     )
 
 

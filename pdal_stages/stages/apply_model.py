@@ -105,11 +105,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is "
         "1, or without that dimension within 0.5 m of it (HeightAboveGround)",
     )
-    memory_mb: int = option(
-        *("integer", 256, "Memory for blocks of points, in addition to the cloud itself", 16),
-        name="memory",
-        unit="MB",
-    )
+    memory_mb: float
 
     def check(self) -> None:
         """Refuse options that contradict each other."""

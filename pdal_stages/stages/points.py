@@ -28,11 +28,6 @@ MAKERS = {
     "Reference": 'Keep the labels before classifying: {"type": "filters.ferry", "dimensions": '
     '"Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
-    "Slope": 'Add {"type": "filters.hag_morphological", "terrain_slope": true} before this stage',
-    **dict.fromkeys(
-        ("Intensity", "ReturnNumber", "NumberOfReturns"),
-        "The reader does not give it; leave it out of the model's dimensions",
-    ),
 }
 #: How the warning begins that a `where` matches no point. Tiles show it if it holds for all.
 NO_POINT_MATCHES = "'where' matches no points:"
@@ -171,7 +166,8 @@ class Points:
         return DimensionError(
             f"the dimension '{name}' is missing",
             found=", ".join(self.arrays),
-            cure=hint or MAKERS.get(name, "Add the stage that makes it before this one"),
+            cure=hint
+            or MAKERS.get(name, "Add the stage that makes it, or leave it out of the options"),
         )
 
     def _array(self, name: str) -> NDArray:

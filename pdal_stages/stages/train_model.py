@@ -88,11 +88,6 @@ class TrainModel(Stage, settings=TrainingOptions):
     files: list = option(
         "list", (), "Input files that the model file names; default: those of the readers"
     )
-    memory_mb: int = option(
-        *("integer", 512, "Memory for blocks of points, in addition to the samples", 16),
-        name="memory",
-        unit="MB",
-    )
 
     def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
         super().__init__(with_recipe(raw_options), place)
