@@ -136,8 +136,8 @@ def _plugin() -> Iterator[Finding]:
 def _machine() -> Iterator[Finding]:
     free = free_memory()
     cure = "" if free >= _LITTLE_MEMORY else "Work in tiles (--tile), or close other programs"
-    found = f"{available_threads()} cores, {free / 2**30:.1f} GB of free memory"
-    yield Finding("machine", found, cure, needed=False)
+    described = f"{available_threads()} cores, {free / 2**30:.1f} GB of free memory"
+    yield Finding("machine", described, cure, needed=False)
 
 
 def _extras() -> Iterator[Finding]:
