@@ -12,9 +12,7 @@ from pdal_stages.features import compute_features
 from pdal_stages.features.adaptive import curvature_threshold, radii_of
 from pdal_stages.features.engine import FeatureEngine
 from pdal_stages.features.moments import M
-from pdal_stages.features.nearest_neighbors import build_tree
 from pdal_stages.features.plan import FeaturePlan
-from pdal_stages.features.point_grid import build_grid
 
 CHECKED = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
 
@@ -68,12 +66,6 @@ CLOUDS = {
 }
 
 
-def tree_of(xyz):
-    """The tree over the sorted cloud, as the engine builds it."""
-    grid = build_grid(np.ascontiguousarray(xyz), 1.0)
-    return build_tree(grid.x, grid.y, grid.z)
-
-
 def some(xyz, most=60):
     return xyz[np.unique(np.linspace(0, len(xyz) - 1, most).astype(int))]
 
@@ -105,25 +97,6 @@ def check_nearest(xyz, queries, need, cap=math.inf):
             f"query {i}"
         )
         assert np.array_equal(table[M.SX : M.SZ + 1, i], sums)
-
-
-# ---- the tree ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("cloud", CLOUDS)
-def test_tree_boxes_hold_their_points(cloud):
-    tree = tree_of(CLOUDS[cloud])
-    assert np.array_equal(np.sort(tree.perm), np.arange(len(tree.x)))
-
-    def visit(node, lo, hi, depth):
-        points = np.c_[tree.x, tree.y, tree.z][tree.perm[lo:hi]]
-        assert np.array_equal(tree.boxes[node], np.r_[points.min(axis=0), points.max(axis=0)])
-        if depth:
-            mid = (lo + hi) // 2
-            visit(2 * node + 1, lo, mid, depth - 1)
-            visit(2 * node + 2, mid, hi, depth - 1)
-
-    visit(0, 0, len(tree.x), tree.depth)
 
 
 # ---- the nearest -------------------------------------------------------------------------------------------

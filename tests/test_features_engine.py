@@ -4,7 +4,6 @@ import json
 import os
 import sys
 import textwrap
-import threading
 
 import numpy as np
 import pytest
@@ -222,21 +221,6 @@ def test_blocks_cover_every_query_once(cloud, whole):
         assert len(seen) == count and np.array_equal(
             np.sort(seen), np.arange(len(cloud)) if queries is None else queries
         )
-
-
-def test_blocks_are_computed_in_the_workers(cloud):
-    large = np.vstack([cloud + np.array([30.0 * i, 0, 0]) for i in range(20)])
-    run = FeatureEngine(large, FeaturePlan.parse("c1,c3,s3", MOMENTS), threads=2).run(memory_mb=16)
-    computed = run.compute
-    threads = set()
-
-    def compute(block):
-        threads.add(threading.get_ident())
-        return computed(block)
-
-    run.compute = compute
-    assert sum(len(block.rows) for block in run.computed()) == len(large)
-    assert len(run.ranges) > 1 and threading.get_ident() not in threads
 
 
 def test_report(cloud):

@@ -6,8 +6,6 @@ import math
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pdal_stages.base.errors import OptionError
 from pdal_stages.features import compute_features
@@ -210,18 +208,6 @@ def test_counts_are_the_oracle_s(shape):
             np.cumsum(counts[m] * PULLS - oracle.shape_counts(expected, rows[m]) * PULLS)
         )
         assert difference.max() <= near + 1e-3, name
-
-
-@settings(max_examples=25, deadline=None)
-@given(
-    st.lists(st.tuples(*[st.floats(-50, 50, width=32)] * 3), min_size=1, max_size=40),
-    st.lists(st.floats(0, 3, width=32), min_size=9, max_size=9),
-)
-def test_counts_always_sum_to_all_pulls(members, thresholds):
-    bins = ShapeBins({"c1": np.tile(np.sort(thresholds), (5, 1))})
-    counts, values, _ = counts_and_values(np.array(members, float), bins)
-    assert np.array_equal(np.round(counts * PULLS).sum(axis=1), [PULLS] * 5)
-    assert (counts >= 0).all() and np.isfinite(values).all()
 
 
 def test_a_bin_includes_its_upper_threshold():

@@ -35,21 +35,11 @@ def scene(seed=0, density=8.0, side=150):
         parts.append(points)
         codes.append(np.full(len(points), code))
 
-    for k in range(3):
-        s = np.sort(rng.uniform(0, side, int(side * 4)))
-        z = (
-            14 + 3 * k + 0.0009 * (np.abs(s - 75) - 75) ** 2 * -1 + 0.0009 * 75**2
-        )  # lowest between the towers
-        add(
-            np.column_stack(
-                [
-                    s,
-                    30 + 0.4 * s + 0.3 * k + rng.normal(0, 0.03, len(s)),
-                    z + rng.normal(0, 0.03, len(s)),
-                ]
-            ),
-            14,
-        )
+    for k in range(3):  # lowest between the towers
+        s = rng.uniform(0, side, int(side * 4))
+        z = 14 + 3 * k + 0.0009 * (75**2 - (np.abs(s - 75) - 75) ** 2)
+        wire = np.column_stack([s, 30 + 0.4 * s + 0.3 * k, z])
+        add(wire + rng.normal(0, (0, 0.03, 0.03), wire.shape), 14)
     for x, y in ((40, 110), (60, 115), (120, 20), (100, 15)):
         m = 1500
         p = rng.normal(0, 1, (m, 3))
@@ -113,31 +103,23 @@ def test_degenerate_clouds_and_points_left_out():
     assert not detect(xyz, codes != 14).any()
 
 
-def edge(kind, density, seed=0):
+def edge(kind, density):
     """A house 70 m long: a terrace in front of its upper floor, a cornice under a steep roof, or a balcony on its wall."""
-    rng = np.random.default_rng(seed)
-    n = int(140 * 80 * density)
-    x, y = rng.uniform(0, 140, n), rng.uniform(0, 80, n)
-    inside, z = (x > 30) & (x < 100), np.zeros(n)
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform((0, 0), (140, 80), (int(140 * 80 * density), 2)).T
+    inside, away, z = (x > 30) & (x < 100), np.abs(y - 40), np.zeros(len(x))
+    wall = rng.uniform((30, 29.92, 0), (100, 29.98, 20), (int(140 * density), 3))  # hit from aside
     if kind == "terrace":
-        z = np.where(inside & (y > 30) & (y < 50), 20.0, z)
-        z = np.where((x > 33) & (x < 97) & (y > 33) & (y < 47), 24.0, z)
+        z[inside & (away < 10)] = 20.0
+        z[(x > 33) & (x < 97) & (away < 7)] = 24.0
     elif kind == "cornice":
-        house = inside & (y > 30) & (y < 50)
-        z = np.where(
-            house, np.where((y < 31.2) | (y > 48.8), 12.0, 13.5 + 1.2 * (10 - np.abs(y - 40))), z
-        )
+        house = inside & (away < 10)
+        z[house] = np.where(away > 8.8, 12.0, 13.5 + 1.2 * (10 - away))[house]
     else:
-        z = np.where(
-            inside & (y > 30) & (y < 50), 20.0, np.where(inside & (y > 28.6) & (y <= 30), 6.0, z)
-        )
-        high = rng.uniform(0, 20, int(70 * 2 * density))  # its wall, hit from aside
-        wall = np.column_stack(
-            [rng.uniform(30, 100, len(high)), rng.normal(29.95, 0.03, len(high)), high]
-        )
-        xyz = np.column_stack([x, y, z + rng.normal(0, 0.05, n)])
-        return np.round(np.vstack([xyz, wall]), 3)
-    return np.round(np.column_stack([x, y, z + rng.normal(0, 0.05, n)]), 3)
+        z[inside & (away < 10)] = 20.0
+        z[inside & (y > 28.6) & (y <= 30)] = 6.0
+    xyz = np.column_stack([x, y, z + rng.normal(0, 0.05, len(x))])
+    return np.round(np.vstack([xyz, wall] if kind == "balcony" else [xyz]), 3)
 
 
 @pytest.mark.parametrize(
