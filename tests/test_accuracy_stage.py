@@ -133,19 +133,9 @@ def test_files_are_compared_in_pairs_of_their_name(tmp_path, write_las, capfd):
             np.arange(900) < 180, 5, arrays["Classification"]
         ).astype(np.uint8)
         write_las(tmp_path / "found" / f"c_{name}.laz", arrays)
-    for sources in (
-        [tmp_path / "found"],
-        [tmp_path / "found" / "c_*.laz"],
-        sorted((tmp_path / "found").iterdir()),
-    ):
-        words = [
-            "accuracy",
-            *sources,
-            "--reference",
-            tmp_path / "true",
-            "--html",
-            tmp_path / "a.html",
-        ]
+    found, more = tmp_path / "found", ["--html", tmp_path / "a.html"]
+    for sources in ([found], [found / "c_*.laz"], sorted(found.iterdir())):
+        words = ["accuracy", *sources, "--reference", tmp_path / "true", *more]
         assert main([str(w) for w in words]) == 0
         out, _ = capfd.readouterr()
         assert re.search(r"Points compared +2,430\b", out)

@@ -12,12 +12,8 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_check import check_complete
 
 COUNT = 300
-FAUX = {
-    "type": "readers.faux",
-    "count": COUNT,
-    "mode": "uniform",
-    "bounds": "([0,100],[0,100],[0,9])",
-}
+BOUNDS = "([0,100],[0,100],[0,9])"
+FAUX = {"type": "readers.faux", "count": COUNT, "mode": "uniform", "bounds": BOUNDS}
 CASES = {
     "a.las": {},
     "b.laz": {"compression": "laszip"},
@@ -36,14 +32,8 @@ def test_cut_files_are_refused(tmp_path, pdal_program, name):
     with pytest.raises(StageError, match="could not be written completely"):
         check_complete(path, name, writer, COUNT + 1)
     size = len(content)
-    for length in {
-        0,
-        1,
-        size // 2,
-        size - 2,
-        size - 1,
-        *np.random.default_rng(1).integers(0, size, 40).tolist(),
-    }:
+    lengths = np.random.default_rng(1).integers(0, size, 40).tolist()
+    for length in (0, 1, size // 2, size - 2, size - 1, *lengths):
         path.write_bytes(content[:length])
         with pytest.raises(StageError, match="could not be written completely"):
             check_complete(path, name, writer, COUNT)

@@ -12,7 +12,7 @@ import threading
 import pytest
 
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.files import PREFIX, sweep, whole_files, work_folder, write_whole
+from pdal_stages.base.files import PREFIX, sweep, whole_files, write_whole
 
 unix = pytest.mark.skipif(os.name == "nt", reason="links, modes and devices of Unix")
 
@@ -51,18 +51,6 @@ def test_several_files_appear_together_or_not_at_all(tmp_path):
             if os.name != "nt":
                 assert stat.S_IMODE(partial.parent.stat().st_mode) == 0o700
     assert names(tmp_path) == ["a.txt", "b.txt"] and a.read_text() == b.read_text() == "new"
-
-
-def test_a_work_folder_is_one_that_is_swept(tmp_path):
-    """`train` uses such a folder: what these leave when they are killed goes with the next file."""
-    with work_folder(tmp_path / "new.model") as folder:
-        (folder / "points.npz").touch()
-        sweep(tmp_path)
-        assert [path.name.startswith(PREFIX) for path in tmp_path.iterdir()] == [True]
-        assert (folder / "points.npz").exists()
-    assert not names(tmp_path)
-    with work_folder("/dev/null") as folder:
-        assert folder.parent != tmp_path and folder.is_dir()
 
 
 def test_numbered_files_and_files_beside(tmp_path):

@@ -230,19 +230,11 @@ def test_a_map_of_the_same_size_and_time_is_noticed_at_resume(tmp_path, write_la
     arrays = {"X": x, "Y": y, "Z": 0 * x, "Classification": np.full(len(x), 2, np.uint8)}
     wkt = pyproj.CRS(RD).to_wkt("WKT1_GDAL")
     source = write_las(tmp_path / "in.las", arrays, point_format=6, wkt=wkt)
-    out = tmp_path / "out.las"
-    lake = tmp_path / "lake.shp"
-    stages = [
-        {"type": "readers.las", "filename": str(source)},
-        {"type": "filters.polygons", "polygons": [f"{lake}=9"]},
-        {"type": "writers.las", "filename": str(out)},
-    ]
-    sizes = set()
+    out, lake = tmp_path / "out.las", tmp_path / "lake.shp"
+    stages = [str(source), {"type": "filters.polygons", "polygons": [f"{lake}=9"]}, str(out)]
     for west in (11.5, 21.5):
         write(lake, [shapely.box(west, 11.5, west + 9, 19.5)])
         os.utime(lake, ns=(10**18, 10**18))
-        sizes.add(lake.stat().st_size)
         assert not ps.run_tiled(stages, 20.0, resume=True, workers=0).failures
         water = np.asarray(laspy.read(out).classification) == 9
         assert np.array_equal(water, (abs(x - west - 4.5) < 4.5) & (y > 11.5) & (y < 19.5))
-    assert len(sizes) == 1

@@ -332,16 +332,6 @@ def whole_files(
             place.close()
 
 
-@contextlib.contextmanager
-def work_folder(target: str | os.PathLike) -> Iterator[Path]:
-    """Yield a hidden folder beside an output for intermediate files; it is removed at the end."""
-    place = _Place(Path(target))
-    try:
-        yield place.folder
-    finally:
-        place.close()
-
-
 class _Place:
     """A hidden folder in which one output is written: `partial`, until it gets its name, `path`."""
 

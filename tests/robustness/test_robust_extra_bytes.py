@@ -199,25 +199,6 @@ def test_several_files_by_a_pattern(command, tmp_path, write_las):
     assert np.array_equal(np.unique(values, axis=0), [[0, 2], [1, 0]])
 
 
-def test_a_survey(command, tmp_path, write_las, model):
-    """Files with odd extra bytes and without, an output for each file and for each tile."""
-    (tmp_path / "in").mkdir()
-    right = odd(tmp_path / "in" / "a.laz", write_las)
-    write_las(tmp_path / "in" / "b.laz", scene(seed=2) | {"Mine": np.ones(600)}, point_format=6)
-    per_file, per_tile = tmp_path / "files", tmp_path / "each"
-    for target, words in ((per_file, []), (per_tile, ["--per", "tile"])):
-        command.runs(["classify", tmp_path / "in", f"{target}/", "--model", model, *TILES, *words])
-    out = laspy.read(per_file / "a.laz")
-    extra_names = list(out.point_format.extra_dimension_names)[: len(right)]
-    assert extra_names == list(right) and (laspy.read(per_file / "b.laz")["Mine"] == 1).all()
-    parts = [laspy.read(path) for path in per_tile.glob("*.laz")]
-    assert sum(map(len, parts)) == 1200
-    for name in extra_names:
-        merged = np.concatenate([np.asarray(part[name], float) for part in parts])
-        expected = np.append(np.asarray(right[name], float), np.zeros(600))
-        assert np.allclose(np.sort(merged), np.sort(expected)), name
-
-
 def test_two_of_one_name(command, tmp_path, write_las, model):
     """PDAL holds one dimension of a name, laspy refuses the file: the second one gets another
     name."""

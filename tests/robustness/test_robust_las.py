@@ -264,13 +264,8 @@ def test_fewer_points_in_the_header(command, tmp_path, good, model):
 
 
 def test_a_record_after_the_points(command, tmp_path, write_las, model):
-    command.runs(
-        pipeline(
-            tmp_path,
-            damaged(write_las(tmp_path / "in.las", scene(), point_format=6), after()),
-            model,
-        )
-    )
+    source = damaged(write_las(tmp_path / "in.las", scene(), point_format=6), after())
+    command.runs(pipeline(tmp_path, source, model))
     check(tmp_path)
 
 
