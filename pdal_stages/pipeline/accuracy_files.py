@@ -134,10 +134,9 @@ def _refuse_other_points(judged: Points, true: Points, source: str, reference: s
     """Refuse a reference that holds other points, or the same in another order."""
     difference = f"{judged.count:,} points in {source}, {true.count:,} in {reference}"
     if judged.count == true.count:
-        away = [
-            np.abs(judged.arrays[axis] - true.arrays[axis]) > _FAR_APART for axis in ("X", "Y", "Z")
-        ]
-        number = max(map(np.count_nonzero, away))
+        axes = [axis for axis in ("X", "Y", "Z") if axis in judged.arrays and axis in true.arrays]
+        away = [np.abs(judged.arrays[axis] - true.arrays[axis]) > _FAR_APART for axis in axes]
+        number = max(map(np.count_nonzero, away), default=0)
         if not number:
             return
         difference = f"{number:,} points of {source} and {reference} lie apart"

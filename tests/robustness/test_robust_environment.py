@@ -173,7 +173,7 @@ def test_signals(command, tmp_path, name, ours):
     """While PDAL works, and while a stage of ours does: the older result stays, and the next run
     tidies up."""
     out = tmp_path / "out.las"
-    out.write_bytes(b"an older result")
+    out.write_bytes(b"LASF, an older result")
     faux = {
         "type": "readers.faux",
         "count": 2_000_000,
@@ -195,7 +195,7 @@ def test_signals(command, tmp_path, name, ours):
     process.send_signal(getattr(signal, name))
     _, err = process.communicate(timeout=60)
     assert process.returncode == -getattr(signal, name), (process.returncode, err)
-    assert "Traceback" not in err and out.read_bytes() == b"an older result"
+    assert "Traceback" not in err and out.read_bytes() == b"LASF, an older result"
     command.runs(["expand", path, "-o", tmp_path / "expanded.json"])
     assert not list(tmp_path.glob(partial))
 
