@@ -1,4 +1,4 @@
-"""Objects: against a slow twin, in any order, in blocks and tiles, of bad input, and on the generated town."""
+"""Objects: against a slow twin, in any order, in blocks and tiles, of bad input."""
 
 from __future__ import annotations
 
@@ -82,21 +82,6 @@ def test_a_house_is_measured():
     assert row["area"] == pytest.approx(96, abs=6) and row["h_ridge"] == row["h_eave"] == 6.0
     assert row["ground"] == 0 and row["verdict"] == "sure"
     assert int(table.ids[0]) == int(object_id(Kind.BUILDING, np.array(20), np.array(20)))
-
-
-def test_tops_of_two_cones():
-    rng = np.random.default_rng(1)
-    xy = rng.uniform(0, 30, (9000, 2))
-    z = np.maximum(
-        *(h - 1.6 * np.hypot(*(xy - p).T) for h, p in ((9.0, (10, 15)), (7.0, (17, 15))))
-    )
-    leaves = np.column_stack([xy, z])[z > 1]
-    got = found_in(*scene((leaves, np.full(len(leaves), 5, np.uint8))))
-    table = got.tables[Kind.TREE]
-    assert len(table) == 2
-    order = np.argsort(table.columns["height"])
-    np.testing.assert_allclose(table.columns["x"][order], [17, 10], atol=0.6)
-    np.testing.assert_allclose(table.columns["height"][order], [7, 9], atol=0.6)
 
 
 def test_decks_have_room_below():
