@@ -51,9 +51,9 @@ def test_units_of_references():
 
 def test_vegetation_too_high_to_be_true_doubts_the_unit_of_z():
     feet = np.linspace(0, 40, 5000) / 0.3048  # of a wood 40 m high, taken for meters
-    assert "override_srs" in doubt_vertical_unit(feet, 1.0)
+    assert "override_srs" in doubt_vertical_unit(feet, 0.0, 1.0)
     for fine in (np.linspace(0, 95, 5000), feet[:900], np.append(np.zeros(5000), [500.0] * 40)):
-        assert not doubt_vertical_unit(fine, 1.0)
+        assert not doubt_vertical_unit(fine, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(

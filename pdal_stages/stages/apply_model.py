@@ -19,7 +19,7 @@ from ..base.asprs import (
 )
 from ..base.errors import OptionError
 from ..base.progress import Progress
-from ..base.units import doubt_vertical_unit
+from ..base.units import doubt_vertical_unit, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
@@ -223,6 +223,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         }
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
         ground = self._may_be_ground(points) if self.given_ground else None
+        slope = median_slope(points.xyz, points.dimension(HEIGHT)) if HEIGHT in points.arrays else 0
         points.keep_only([*dimensions, *self.creates(), HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             prediction = self.model.predict(
@@ -244,7 +245,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         if HEIGHT in points.arrays:
             leaves = wanted & np.isin(codes, (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION))
             leaf_heights = points.dimension(HEIGHT)[leaves]
-            doubt = doubt_vertical_unit(leaf_heights, points.units.vertical)
+            doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical)
             points.report.warnings += [doubt] if doubt else []
         values = self._columns(points, prediction)
         if self.mark:
