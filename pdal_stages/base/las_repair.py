@@ -342,6 +342,13 @@ def _renamed(entry: bytes, name: str) -> bytes:
     return entry[:4] + name.encode().ljust(32, b"\0") + entry[36:]
 
 
+def overwritten(point_format: int, data: bytes) -> list[str]:
+    """Return the titles in a record that are dimensions of the format: PDAL overwrites these."""
+    entries = (data[at : at + ENTRY] for at in range(0, len(data) - ENTRY + 1, ENTRY))
+    titles = [_title(entry) for entry in entries]
+    return [title for title in titles if _plain(title) in _taken(point_format)]
+
+
 def description(path: str | os.PathLike) -> bytes:
     """Return the first record that describes a file's extra bytes, empty without any.
 

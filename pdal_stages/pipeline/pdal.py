@@ -7,6 +7,7 @@ python-pdal's classes, ``plugin/install.py`` looks for PDAL's library and header
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import logging
@@ -27,7 +28,7 @@ from typing import Any, TypeVar
 from ..base.errors import DependencyError, PipelineError
 from ..base.las import header_there, named_copc, named_las, source_id
 from ..base.las_check import CURE_OF_DAMAGE, check_readable
-from ..base.las_repair import corrected
+from ..base.las_repair import corrected, overwritten
 from .inputs_outputs import readers_files, writers_outputs
 
 INSTALL = (
@@ -443,6 +444,22 @@ def compresses_las_14() -> bool:
 def splits_class_flags() -> bool:
     """Return whether readers split the flags of LAS 1.0-1.3 from the class (from PDAL 2.6 on)."""
     return "Withheld" in {dimension["name"] for dimension in bindings().dimensions}
+
+
+def overwritten_dimensions(metadata: Any) -> list[str]:
+    """Return the dimensions that a reader has overwritten with extra bytes.
+
+    `metadata` is a node, as filters.python has it.
+    """
+    nodes = metadata.get("children", []) if isinstance(metadata, dict) else []
+    values = {node["name"]: node["value"] for node in nodes if isinstance(node, dict)}
+    names = [name for node in nodes for name in overwritten_dimensions(node)]
+    for node in nodes if str(values.get("dataformat_id", "")).isdigit() else ():
+        record = {child["name"]: child["value"] for child in node.get("children", [])}
+        if (record.get("user_id"), str(record.get("record_id"))) == ("LASF_Spec", "4"):
+            data = base64.b64decode(record.get("data", ""))
+            names += overwritten(int(values["dataformat_id"]), data)
+    return names
 
 
 def flags_inside_classification(dimensions: Any, metadata: Any) -> bool:

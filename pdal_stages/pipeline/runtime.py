@@ -202,6 +202,14 @@ def run_on_view(
     outs: dict[str, Any],
 ) -> Report:
     """Run a stage on one view; return its report."""
+    if titles := pdal_env.overwritten_dimensions(module.get("metadata")):
+        raise StageError(
+            "extra bytes are named like dimensions of LAS, so PDAL has overwritten these",
+            found=", ".join(titles),
+            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under "
+            'other names; or name them all yourself: readers.las with "ignore_vlr": '
+            '"LASF_Spec/4" and "extra_dims": "Name=type,..."',
+        )
     lent = ins.keys() - outs.keys() if isinstance(ins, dict) else frozenset()
     points = points_of(stage, context, module, ins, lent)
     for name in stage.reads():

@@ -3,13 +3,16 @@ LAS headers."""
 
 from __future__ import annotations
 
+import json
 import struct
+import subprocess
 
 import laspy
 import numpy as np
 import pytest
 from robustness_kit import HAG, job, las, scene
 
+import pdal_stages as ps
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_repair import extra_dimensions
 from pdal_stages.pipeline import pdal as pdal_env
@@ -117,6 +120,18 @@ def test_every_door_reads_them_under_another_name(command, tmp_path, write_las, 
         assert np.array_equal(out.classification, right.classification)
         assert np.array_equal(out.gps_time, right.gps_time)
         assert np.array_equal(out[f"Extra_{title}"], values)
+
+
+def test_stock_pdal_is_told(tmp_path, write_las, pdal_program):
+    """PDAL has overwritten the coordinates before a stage of ours sees them."""
+    source = write_las(tmp_path / "in.las", {**scene(), "Qqq": np.ones(600)}, point_format=6)
+    with_titles(source, {"Qqq": "Z"})
+    expanded = tmp_path / "expanded.json"
+    expanded.write_text(json.dumps(json.loads(ps.Pipeline([str(source), HAG]).json)["pipeline"]))
+    done = subprocess.run(
+        [pdal_program, "pipeline", str(expanded)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode and "PDAL has overwritten these (found Z)" in done.stderr
 
 
 # ---- arrays, type 0, bytes without a description, odd names -----------------------------------------------
