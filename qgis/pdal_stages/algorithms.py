@@ -170,7 +170,12 @@ class ClassifySurvey(_Classifying):
         )
         self.addParameter(parameter)
         self.add_destination(
-            "REPORT", "Report", self.help_of("report"), _REPORTS, optional=True, createByDefault=False
+            "REPORT",
+            "Report",
+            self.help_of("report"),
+            _REPORTS,
+            optional=True,
+            createByDefault=False,
         )
         self.addParameter(QgsProcessingParameterBoolean("SHOW", _SHOW, defaultValue=False))
 
