@@ -86,9 +86,11 @@ def test_it_is_said_that_there_is_no_score_and_what_to_label_next(tmp_path, writ
     assert "Label in more places" in output.err and "not scored" in output.out
     info = ps.load_model(tmp_path / "m.model").info
     assert info["accuracy"]["cross_validation"] is None and "sureness" not in info
+    labels = '{"2": "Ground", "1,6": "6 Roofs"}'  # JSON, as docs/train.md has it
     assert main(["train", str(tmp_path / "a.laz"), "--model", str(tmp_path / "m.model"), *QUICK_WORDS,
-                 "--writers.classifiermodel.folds=0"]) == 0  # fmt: skip
-    assert "no score" not in capsys.readouterr().err
+                 "--writers.classifiermodel.folds=0", "--classes", labels]) == 0  # fmt: skip
+    output = capsys.readouterr()
+    assert "no score" not in output.err and "6 Roofs" in output.out
 
 
 @pytest.mark.pdal

@@ -16,10 +16,7 @@ from typing import Any
 from ..base.checks import refuse_constant
 from ..base.errors import OptionError, PipelineError, suggest
 
-#: A pipeline of so many bytes is another file, or a device.
-_MOST_BYTES = 1 << 26
-
-#: No pipeline file has as many bytes; devices have no end.
+#: No pipeline file has as many bytes; devices, such as /dev/zero, have no end.
 _MOST_BYTES = 1 << 26
 
 
@@ -56,7 +53,7 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
     try:
         with open(source, "rb") as file:
             data = file.read(_MOST_BYTES)
-        if len(data) == _MOST_BYTES:  # /dev/zero has no end
+        if len(data) == _MOST_BYTES:
             raise OSError(f"{_MOST_BYTES >> 20} MB or more, too much for a pipeline")
     except (OSError, ValueError) as error:
         where = ascii(text[:200])[1:-1]

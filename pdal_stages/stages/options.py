@@ -202,7 +202,12 @@ class Option:
         return value
 
     def _parse_classes(self, value: Any) -> Any:
-        """Leave the reading to :class:`..classifier.class_map.ClassMap`."""
+        """Leave the reading to :class:`..classifier.class_map.ClassMap`, but for JSON in a text."""
+        if isinstance(value, str) and value.lstrip().startswith(("{", "[")):
+            try:
+                value = checks.strict_json(value)
+            except (ValueError, RecursionError):
+                raise self._wrong(value) from None
         if not isinstance(value, str | list | dict):
             raise self._wrong(value)
         return value
