@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
-from alsnet_scenes import TINY, coverage
+from alsnet_scenes import TINY, coverage, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.alsnet.batches import (
     Batches,
     ball_query,
+    build_pyramid,
     farthest_point_sampling,
     interpolation_weights,
+    join_pyramids,
     random_order,
     spacing_for,
 )
@@ -162,3 +164,17 @@ def test_scramble_follows_the_coordinates():
 def test_bad_configurations(given, text):
     with pytest.raises(OptionError, match=text):
         parse_configuration(given)
+
+
+def test_stacked_pyramids_do_not_mix():
+    parts = [
+        build_pyramid(scene(n, 6.0, n)[0], np.full((n, 1), n, np.float32), TINY)
+        for n in (100, 256, 30)
+    ]
+    whole = join_pyramids(parts)
+    fine = np.repeat(np.arange(3), [100, 256, 30])
+    for k, step in enumerate(whole.steps):
+        coarse = np.repeat(np.arange(3), [len(part.steps[k].groups) for part in parts])
+        assert (fine[step.groups] == coarse[:, None]).all()
+        assert (coarse[step.nearest] == fine[:, None]).all()
+        fine = coarse

@@ -10,6 +10,7 @@ gathers and multiplies.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -348,3 +349,25 @@ def build_pyramid(
         steps.append(Step(groups, offsets.astype(np.float32), near, weights))
         xyz, start = coarse, 0
     return Pyramid(inputs, tuple(steps))
+
+
+def join_pyramids(pyramids: Sequence[Pyramid]) -> Pyramid:
+    """Join batches into one that never mixes them: rows follow each other."""
+    if len(pyramids) == 1:
+        return pyramids[0]
+    steps = []
+    fine = [len(pyramid.inputs) for pyramid in pyramids]
+    for parts in zip(*(pyramid.steps for pyramid in pyramids), strict=True):
+        coarse = [len(part.groups) for part in parts]
+        above = np.concatenate(([0], np.cumsum(fine)[:-1])).astype(np.int32)
+        below = np.concatenate(([0], np.cumsum(coarse)[:-1])).astype(np.int32)
+        steps.append(
+            Step(
+                np.concatenate([part.groups + k for part, k in zip(parts, above, strict=True)]),
+                np.concatenate([part.offsets for part in parts]),
+                np.concatenate([part.nearest + k for part, k in zip(parts, below, strict=True)]),
+                np.concatenate([part.weights for part in parts]),
+            )
+        )
+        fine = coarse
+    return Pyramid(np.concatenate([pyramid.inputs for pyramid in pyramids]), tuple(steps))

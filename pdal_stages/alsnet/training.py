@@ -19,7 +19,7 @@ from ..classifier.model import Model, load_model
 from ..classifier.sampling import figures
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
-from .batches import SHIFT, Pyramid
+from .batches import SHIFT, Pyramid, join_pyramids
 from .classifier import AlsNet
 from .configuration import NetworkOptions
 from .network import Weights, check_weights, initial_weights
@@ -164,17 +164,18 @@ class NetworkTraining:
         self.network.train()
         total, weight = 0.0, 0
 
-        def prepare(numbers: list[int]) -> list[tuple[Pyramid, npt.NDArray[np.int64]]]:
-            return [self._augmented_batch(self.selected[k], epoch) for k in numbers]
+        def prepare(numbers: list[int]) -> tuple[int, Pyramid, npt.NDArray[np.int64]]:
+            parts = [self._augmented_batch(self.selected[k], epoch) for k in numbers]
+            labels = np.concatenate([labels for _, labels in parts])
+            return len(numbers), join_pyramids([pyramid for pyramid, _ in parts]), labels
 
-        for numbers, parts in zip(steps, map_blocks(prepare, steps, self.threads), strict=True):
+        for count, pyramid, labels in map_blocks(prepare, steps, self.threads):
+            known = int(np.count_nonzero(labels >= 0))
             # A single point has no variance to be normalized by.
-            parts = [(pyramid, labels) for pyramid, labels in parts if len(labels) > 1]
-            known = sum(int(np.count_nonzero(labels >= 0)) for _, labels in parts)
-            if known:
-                total += self._step(parts) * known
+            if known and len(labels) > 1:
+                total += self._step(pyramid, labels) * known
                 weight += known
-            bar.update(len(numbers))
+            bar.update(count)
         return total / weight if weight else 0.0
 
     def _augmented_batch(self, number: int, epoch: int) -> tuple[Pyramid, npt.NDArray[np.int64]]:
@@ -191,13 +192,13 @@ class NetworkTraining:
         rows, pyramid = data.pyramid(members, center, random if self.options.augment else None)
         return pyramid, data.train_labels[rows]
 
-    def _step(self, parts: list[tuple[Pyramid, npt.NDArray[np.int64]]]) -> float:
+    def _step(self, pyramid: Pyramid, labels: npt.NDArray[np.int64]) -> float:
         """Do a step of the optimizer; return the cross entropy, the loss [WM19 2.4]."""
         torch = self.torch
-        scores = [self.network(self.backend.tensors(pyramid, self.device)) for pyramid, _ in parts]
-        target = torch.from_numpy(np.concatenate([labels for _, labels in parts])).to(self.device)
+        scores = self.network(self.backend.tensors(pyramid, self.device))
+        target = torch.from_numpy(labels).to(self.device)
         loss = torch.nn.functional.cross_entropy(
-            torch.cat(scores), target, weight=self.weight, ignore_index=-1
+            scores, target, weight=self.weight, ignore_index=-1
         )
         value = float(loss.detach())
         if not math.isfinite(value):
