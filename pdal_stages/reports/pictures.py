@@ -87,10 +87,8 @@ def embed(rgb: npt.NDArray[np.uint8]) -> dict[str, Any]:
 
 
 def write_png(path: str | os.PathLike[str], rgb: npt.NDArray[np.uint8]) -> Path:
-    """Write a (height, width, 3) uint8 image as a PNG file, whole or not at all."""
-    file = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(rgb)).save(file, "PNG")
-    return write_whole(path, file.getvalue(), what="picture")
+    """Write :func:`png` of an image as a file, whole or not at all."""
+    return write_whole(path, png(rgb), what="picture")
 
 
 @dataclass(frozen=True)
