@@ -81,7 +81,7 @@ def _protect_names(arguments: Sequence[str]) -> list[str]:
 def _explain(error: Exception) -> StageError:
     """Return an unforeseen error as a message of one paragraph."""
     if isinstance(error, MemoryError):
-        return StageError("memory ran out", cure="Work in tiles (--tile), or lower 'memory'")
+        return StageError("memory ran out", cure="Take fewer points, or work in tiles (--tile)")
     if isinstance(error, UnicodeEncodeError):
         name, cure = ascii(error.object), "Set PYTHONUTF8=1"
         return StageError("a name cannot be written in this locale", found=name, cure=cure)

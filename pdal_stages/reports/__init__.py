@@ -1,1 +1,1 @@
-"""Reports for people: web pages, pictures of a cloud, vector files of objects."""
+"""Reports for people: a web page of accuracy, pictures of a cloud, vector files of objects."""

@@ -118,7 +118,7 @@ BASE = 350 << 20
 TILE_POINT = 285
 #: Bytes of a point of an output file that is assembled.
 FILE_POINT = 250
-#: Bytes that the `memory` option of our stages allows.
+#: Bytes that our stages take for blocks of points, at most by default.
 STAGES = 512 << 20
 #: Bytes of a raster cell of a block of a far-reaching stage.
 _CELL = 200

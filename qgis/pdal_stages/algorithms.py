@@ -115,7 +115,7 @@ class ClassifyFile(_Classifying):
         "return numbers are read; all other dimensions, the header and the reference system stay "
         "as they are."
     )
-    handled = ("model", "objects", "report", "per", "resume", "metadata")
+    handled = ("model", "report", "per", "resume", "metadata")
 
     def initAlgorithm(self, configuration=None):
         self.add_file("INPUT", "Point cloud", "A LAS, LAZ or COPC file, or any that PDAL reads")
@@ -159,7 +159,7 @@ class ClassifySurvey(_Classifying):
         "a canceled run goes on where it stopped."
     )
     listed = ("memory", "resume", *_Classifying.listed)
-    handled = ("model", "objects", "report", "metadata")
+    handled = ("model", "report", "metadata")
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
@@ -402,8 +402,8 @@ class Objects(_Showing):
     key, title, command = "objects", "Buildings, trees, wires and bridges as vectors", "objects"
     about = (
         "Groups the points of classified point clouds into objects and writes them as layers: "
-        "buildings with straight outlines, heights and roofs, trees and crowns, wires, bridge "
-        "decks, each with a verdict: sure, or to be checked and why. Objects across the borders of "
+        "buildings with straight outlines and heights, trees and crowns, wires, bridge decks, "
+        "each with a verdict: sure, or to be checked and why. Objects across the borders of "
         "files are whole."
     )
     listed = ("outlines", "cell")
