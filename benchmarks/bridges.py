@@ -2,7 +2,7 @@
 
 python benchmarks/bridges.py --data FOLDER
 
-Decks of scenes (tests/bridge_scenes.py; 8 points/m2) and of the labeled clouds; wires of those clouds.
+Decks of scenes (tests/bridge_scenes.py; 8 points/m2, none on water) and of the labeled clouds; wires of those clouds.
 Cars, lamps and what was never labeled count neither way. `false` is the share of all points that
 are wrongly taken; seconds are of one process.
 """
