@@ -3,7 +3,8 @@ stand.
 
     python benchmarks/seams.py --data FOLDER
 
-Each cloud is classified as one file and, cut at two lines through buildings, as four in tiles.
+Each cloud is classified as one file and, cut at two lines through buildings, as four: in tiles,
+and each alone.
 Prints how many points differ in class, height or reliability.
 """
 
@@ -92,15 +93,15 @@ def main() -> None:
             whole, parts = cut(path, folder)
             classify(whole, folder / "whole.laz")
             classify(*parts, folder / "tiles/", "--tile", o.tile)
-            first, other = (
-                ordered([folder / "whole.laz"]),
-                ordered([folder / "tiles" / p.name for p in parts]),
-            )
-            assert np.array_equal(first["xyz"], other["xyz"])
-            print(
-                "  "
-                + ", ".join(f"{n} {np.count_nonzero(first[n] != other[n]):,}" for n in DIMENSIONS)
-            )
+            (folder / "alone").mkdir()
+            for part in parts:
+                classify(part, folder / "alone" / part.name)
+            first = ordered([folder / "whole.laz"])
+            for way in ("tiles", "alone"):
+                other = ordered([folder / way / part.name for part in parts])
+                assert np.array_equal(first["xyz"], other["xyz"])
+                differ = {n: np.count_nonzero(first[n] != other[n]) for n in DIMENSIONS}
+                print(f"  {way}:", ", ".join(f"{n} {count:,}" for n, count in differ.items()))
 
 
 if __name__ == "__main__":
