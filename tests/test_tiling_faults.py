@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import pickle
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -103,6 +105,21 @@ def test_killed_workers(tmp_path, folder):
     report = json.loads((tmp_path / "r.json").read_text())
     assert [tile["name"] for tile in report["tiles"] if tile["state"] == "failed"] == ["60_0"]
     assert len(list(tmp_path.glob("o_*.laz"))) == 7 and not clouds.hidden(tmp_path)
+
+
+def test_points_of_a_tile_do_not_stay(request):
+    """Pipelines refer to themselves; a command's collector leaves them for hundreds of tiles."""
+    gc.disable()
+    request.addfinalizer(gc.enable)
+    seen = []
+
+    def task():
+        points = type("Points", (), {})()
+        points.own = points
+        seen.append(weakref.ref(points))
+
+    workers.ThisProcess(1).submit(task)
+    assert seen[0]() is None
 
 
 def test_a_failure_of_every_tile_stops_the_run(tmp_path, folder):
