@@ -43,8 +43,6 @@ class OutlineRules:
 
 
 RULES = OutlineRules()
-#: Fewest coordinates of a ring, the first of which is also the last.
-MIN_RING = 4
 
 
 def raw_outlines(table: ObjectTable, size: float, *, hole: float = RULES.min_hole) -> list[Any]:

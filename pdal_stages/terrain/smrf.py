@@ -259,11 +259,11 @@ def _regain_ground(raster: GroundRaster, wanted: GridWindow, options: FilterOpti
     There are several rounds, each of which sees less around the `wanted` cells.
     """
     step, kept = options.round_reach, raster.window
+    rise = SPREAD_SLOPE * options.cell
     measured = np.isfinite(raster.lowest)
     for number in range(1, ROUNDS + 1):
         for _ in range(SPREADS):
             cells = np.flatnonzero(measured & ~raster.ground)
-            rise = SPREAD_SLOPE * options.cell
             level = _among_ground(
                 cells, raster.lowest, raster.ground, options.spread_cells, rise, SPREAD_SHARE
             )
