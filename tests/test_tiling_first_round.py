@@ -179,6 +179,9 @@ def test_thousands_of_lone_points_are_refused_before_any_of_them_is_worked_on(tm
 )
 def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, strays):
     x, y, z, _ = town(4, side=700, density=0.2, origin=origin)
+    far = np.maximum(np.abs(x - origin[0] - 100), np.abs(y - origin[1] - 590))
+    z[far < 150] = 0.02 * (x[far < 150] - origin[0]) + 100  # bare land, and a hall on it
+    z[far < 50] += 12.0
     if strays:  # far from all else, and a hole in the middle
         away = np.random.default_rng(1).uniform(0, 60, (2, 400))
         x, y, z = (
@@ -190,6 +193,8 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         x, y, z = x[kept], y[kept], z[kept]
     options = {"window": window, "openings": (5, 9), "slope_too": True, "cell": cell}
     whole = filtered_ground(x, y, z, **options)
+    hall = np.maximum(np.abs(x - origin[0] - 100), np.abs(y - origin[1] - 590)) < 50
+    assert whole["Ground"][hall].mean() < 0.1
     options_values = FilterOptions(cell=cell, window=window, openings=(5, 9))
     u, v = x - origin[0], y - origin[1]
     for box in (

@@ -39,7 +39,7 @@ class HagMorphological(FarReaching):
         "after Pingel, Clarke, McBride 2013 (SMRF), ISPRS Journal of Photogrammetry and Remote "
         "Sensing 77, 21-30"
     )
-    algorithm_version = 5
+    algorithm_version = 6
     where_help = HEIGHTS_OUTSIDE
     in_models = (*_FILTER, "ignore", "ground", "terrain_slope", "given_ground", "where")
     cell: float = option("number", 1.0, "Side of the grid's cells", 0.05, 1000, unit="m")
@@ -53,7 +53,8 @@ class HagMorphological(FarReaching):
     window: float = option(
         "number",
         18.0,
-        "Radius of the largest window: half the width of the largest object that is removed",
+        "Radius of the largest window: half the width of the largest object that is removed; wider "
+        "roofs, up to 220 m, are removed where most of their outline is a step",
         *(0, 10_000),
         exclusive=True,
         unit="m",

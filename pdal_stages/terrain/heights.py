@@ -19,7 +19,7 @@ surveys thinned to 1 point/m2 from 1.27 to 1.12. `threshold` is 0.4, there 0.5: 
 among ground it lowers these three means to 0.55, 3.16 and 1.01. One more survey, rocks that rise
 from the sea, is left out: its error is 77.2, and 73.2 with slope 0.15 (docs/results/ablation.md).
 What lies beyond the cloud's end or in a hole is unknown, and no evidence for an object. Roofs wider
-than the window stay ground: a classifier tells them by heights above openings of other widths.
+than the window are found by themselves (:mod:`.wide_roofs`).
 
 [P13] Pingel, Clarke, McBride (2013): An improved simple morphological filter for the terrain
 classification of airborne LIDAR data. ISPRS Journal of Photogrammetry and Remote Sensing 77, 21-30.
@@ -172,7 +172,13 @@ def _heights(
 def _filtered_pieces(points: GroundPoints, options: FilterOptions) -> Iterator[_Piece]:
     """Yield pieces of the cloud with the ground that the filter finds."""
     for rows, core in patches(points.column, points.row, options.reach_of_points, options.link):
-        yield _Piece(rows, core, ground_raster(points.take(rows), options))
+        part, near = points.take(rows), None
+        if not isinstance(core, slice):  # points farther away only tell which cells are ground
+            near = GridWindow.enclosing(part.column[core], part.row[core])
+            near = near.padded(options.reach_of_points - options.reach)
+            seen = near.contains(part.column, part.row)
+            rows, core = rows[seen], core[seen]
+        yield _Piece(rows, core, ground_raster(part, options, wanted=near))
 
 
 def _known_pieces(

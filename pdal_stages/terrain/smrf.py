@@ -23,6 +23,8 @@ from .low_outliers import find_low_outliers, outlier_reach
 from .openings import FILL_RINGS, objects_of
 from .surface import GroundRaster, surface
 from .surface import reach as planes_reach
+from .wide_roofs import RULES as WIDE_ROOFS
+from .wide_roofs import level_below_roofs
 
 #: Side in meters of the coarsest blocks of the provisional surface, which tells ground points. The
 #: mean error of the ISPRS samples is 0.17 points higher with 8 m (docs/results/ablation.md).
@@ -139,9 +141,14 @@ class FilterOptions:
         An opening looks twice its radius away; low outliers are judged before, and surfaces fitted
         through ground after.
         """
-        surfaces = ROUNDS * self.round_reach
+        wide = WIDE_ROOFS.reach(self.cell, self.window)
+        return max(wide, self.reach_of_openings) + ROUNDS * self.round_reach + RIM
+
+    @property
+    def reach_of_openings(self) -> int:
+        """Distance in cells within which lowest points change openings."""
         openings = 2 * max([self.radius, *self.requested_radii]) + 2 * FILL_RINGS
-        return outlier_reach(self.cell) + openings + surfaces + RIM
+        return outlier_reach(self.cell) + openings
 
     @property
     def reach_of_points(self) -> int:
@@ -179,7 +186,8 @@ class FilterOptions:
         No step of the filter sees from a point to another across more empty land.
         """
         openings = max([self.radius, *self.requested_radii]) + 2 * FILL_RINGS
-        return max(outlier_reach(self.cell), openings, planes_reach(self.levels(FAR))) + RIM
+        wide = WIDE_ROOFS.joined(self.cell) * (WIDE_ROOFS.cells(WIDE_ROOFS.radius, self.cell) + 1)
+        return max(outlier_reach(self.cell), openings, planes_reach(self.levels(FAR)), wide) + RIM
 
 
 #: Sums of coordinates are whole numbers of this part of a meter, so that order does not matter.
@@ -221,7 +229,8 @@ def ground_raster(
     """Classify the cells of the minimum grid around points into ground and objects.
 
     The steps are those of SMRF [P13]: minimum grid, low outliers, opening with growing windows;
-    ground that the openings took from ridges is then regained.
+    roofs wider than these are added (:mod:`.wide_roofs`), and ground that the openings took from
+    ridges is regained.
 
     Parameters
     ----------
@@ -232,12 +241,24 @@ def ground_raster(
         The requested cells; the raster holds these and as many around as later steps need.
     """
     window, cell = GridWindow.enclosing(points.column, points.row).padded(margin), options.cell
+    wanted = wanted or window
+    kept = wanted.padded(ROUNDS * options.round_reach).intersect(window)
+    whole, window = window, kept.padded(options.reach_of_openings + RIM).intersect(window)
+    far = points.take(slice(0))
+    if window != whole:
+        inside = window.contains(points.column, points.row)
+        far, points = points.take(points.use & ~inside), points.take(inside)
     lowest, heights = minimum_grid(points, window, cell)
     objects, floor, opened = objects_of(
         heights, cell, options.slope, options.radius, options.requested_radii
     )
-    wanted = wanted or window
-    kept = wanted.padded(ROUNDS * options.round_reach).intersect(window)
+    pairs = zip(points.take(lowest[lowest >= 0]), far, strict=True)
+    seen = GroundPoints._make(np.concatenate(pair) for pair in pairs)
+    land = level_below_roofs(seen.column, seen.row, seen.z, window, cell, options.window)
+    roofs = np.isfinite(heights) & ~objects
+    roofs[roofs] = heights[roofs] - land[roofs] > WIDE_ROOFS.height
+    objects |= roofs
+    floor[roofs] = land[roofs]
     part = kept.slices_in(window)
     lowest, heights = np.ascontiguousarray(lowest[part]), np.ascontiguousarray(heights[part])
     objects, floor = np.ascontiguousarray(objects[part]), np.ascontiguousarray(floor[part])

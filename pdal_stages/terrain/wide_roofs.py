@@ -1,0 +1,132 @@
+"""Roofs wider than the ground filter's window: what stands out of the land and ends in steps.
+
+On a minimum grid of coarse cells, an opening takes what the window knows anyway, a closing fills
+pits and moats, and a wide opening takes what stands out of its surroundings: hilltops, ridges,
+roofs. Most of a roof's outline is a step; a hill's is not, and where the cloud ends is no step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.grid import GridWindow
+from .cells import HOLE
+from .components import linked_cells
+from .openings import FILL_RINGS, fill_holes, highest_around, octagon
+
+
+@dataclass(frozen=True)
+class WideRoofRules:
+    """Thresholds of wide roofs. What they are worth is in docs/results/ablation.md."""
+
+    #: Side of the coarse cells in meters: with 4 m, slopes of the land look like steps.
+    side: float = 2.0
+    radius: float = 110.0  #: half the width of the widest roof, in meters
+    longest: float = 250.0  #: extent of the longest roof along either axis, in meters
+    #: Half the width in meters of pits and moats that are filled: land within a moat is no roof.
+    gap: float = 8.0
+    height: float = 2.0  #: least height above the land around, in meters
+    #: Height in meters of a step. With 2 m half of the wide roofs of a thin cloud are lost.
+    step: float = 1.5
+    #: Least share of a roof's outline that is a step: trees or annexes may stand beside the rest.
+    share: float = 0.6
+
+    def cells(self, length: float, cell: float) -> int:
+        """Return a length in coarse cells."""
+        return max(1, round(length / (self.joined(cell) * cell)))
+
+    def joined(self, cell: float) -> int:
+        """Return how many cells of the ground filter, along either axis, make a coarse one."""
+        return max(1, round(self.side / cell))
+
+    def reach(self, cell: float, window: float) -> int:
+        """Return how far away, in cells of the filter, points change what is a wide roof."""
+        far = 2 * self.radius + self.longest + 2 * window + 2 * self.gap
+        return (self.cells(far, cell) + FILL_RINGS + 6) * self.joined(cell)
+
+
+RULES = WideRoofRules()
+
+
+def level_below_roofs(
+    column: NDArray[np.int64],
+    row: NDArray[np.int64],
+    z: NDArray[np.float64],
+    wanted: GridWindow,
+    cell: float,
+    window: float,
+) -> NDArray[np.float32]:
+    """Return the level of the land below wide roofs and beside them, and HOLE elsewhere.
+
+    Parameters
+    ----------
+    column, row : (n,) int64
+        Cells of points that may be ground.
+    z : (n,) float64
+        Their heights in meters.
+    wanted : GridWindow
+        The cells (h, w) of the result.
+    cell, window : float
+        Side of a cell, and radius of the filter's largest window, in meters.
+    """
+    out, joined = np.full(wanted.shape, HOLE), RULES.joined(cell)
+    if not len(z):
+        return out
+    around = GridWindow.enclosing(*(_ends(axis, joined) for axis in (column, row)))
+    around = around.padded(FILL_RINGS + 1)
+    lowest = np.full(around.width * around.height, HOLE)
+    np.minimum.at(lowest, around.flat_index(column // joined, row // joined), z)
+    level = _coarse_levels(lowest.reshape(around.shape).astype(np.float32), cell, window)
+    rows, columns = (np.arange(n) for n in wanted.shape)
+    rows = (rows + wanted.bottom) // joined - around.bottom
+    columns = (columns + wanted.left) // joined - around.left
+    inside_rows, inside_columns = (
+        (at >= 0) & (at < n) for at, n in zip((rows, columns), around.shape, strict=True)
+    )
+    found = level[np.ix_(rows[inside_rows], columns[inside_columns])]
+    out[np.ix_(inside_rows, inside_columns)] = found
+    return out
+
+
+def _ends(numbers: NDArray[np.int64], joined: int) -> NDArray[np.int64]:
+    """Return the first and last coarse cell along an axis."""
+    return np.array([numbers.min(), numbers.max()]) // joined
+
+
+def _coarse_levels(lowest: NDArray[np.float32], cell: float, window: float) -> NDArray[np.float32]:
+    """Return the land's level below and beside wide roofs of a coarse minimum grid (h, w)."""
+
+    def cells(length: float) -> int:
+        return RULES.cells(length, cell)
+
+    filled = fill_holes(lowest)
+    known = filled != HOLE
+    plain = _dilated(_eroded(filled, known, cells(window)), known, cells(window))
+    plain = _eroded(_dilated(plain, known, cells(RULES.gap)), known, cells(RULES.gap))
+    level = _dilated(_eroded(plain, known, cells(RULES.radius)), known, cells(RULES.radius))
+    above = np.zeros(known.shape, bool)
+    above[known] = plain[known] - level[known] > RULES.height
+    outline = above & highest_around(~above, 1, 0)
+    below = -highest_around(np.where(known & ~above, -plain, -HOLE), 1, 0)
+    stepped = outline & (below <= plain - RULES.step)
+    flat = np.where(above, np.float32(0), HOLE)
+    number, sizes, longest = linked_cells(flat, 1.5, np.ones_like)  # corners touch
+    steps, rim = (np.bincount(number[of], minlength=len(sizes)) for of in (stepped, outline))
+    roofs = (steps >= RULES.share * rim) & (longest < cells(RULES.longest))
+    above[above] = roofs[number[above]]
+    return -highest_around(np.where(above, -level, -HOLE), 1, 0)
+
+
+def _eroded(raster: NDArray, known: NDArray[np.bool_], radius: int) -> NDArray[np.float32]:
+    """Return the lowest known heights (h, w) within a radius of the known cells."""
+    lowest = -highest_around(np.where(known, -raster, -HOLE), *octagon(radius, raster.shape))
+    return np.where(known, lowest, HOLE)
+
+
+def _dilated(raster: NDArray, known: NDArray[np.bool_], radius: int) -> NDArray[np.float32]:
+    """Return the highest known heights (h, w) within a radius of the known cells."""
+    highest = highest_around(np.where(known, raster, -HOLE), *octagon(radius, raster.shape))
+    return np.where(known, highest, HOLE)
