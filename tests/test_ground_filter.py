@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.grid import GridWindow
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain import filtered_ground, wide_roofs
 from pdal_stages.terrain.openings import FILL_RINGS, fill_holes, growing_radii, objects_of
 from pdal_stages.terrain.smrf import FilterOptions
 from pdal_stages.terrain.surface import GroundRaster, planes_of_blocks
@@ -235,6 +236,26 @@ def test_a_wide_roof_is_no_ground(half, angle):
     assert found["Ground"][roof].mean() < 0.01 and found["Ground"][~roof].mean() > 0.99
     error = np.abs(found["HeightAboveGround"][roof] - z[roof] + 0.03 * x[roof])
     assert np.percentile(error, 99) < 2
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_wide_roofs_need_no_points_beyond_their_reach(seed):
+    rng = np.random.default_rng(seed)
+    coarse = rng.choice([0.0, 3.0, 4.0], (30, 30), p=[0.8, 0.1, 0.1])
+    z = np.kron(coarse, np.ones((5, 5))) + rng.choice([0.0, 9.0], (150, 150), p=[0.99, 0.01])
+    row, column = (at.ravel() - 75 for at in np.indices(z.shape))
+    wanted = GridWindow(-2, -2, 4, 4)
+    rules = wide_roofs.WideRoofRules(side=1.0, radius=9.0, longest=16.0, gap=1.0)
+    with mock.patch.object(wide_roofs, "RULES", rules):
+        reach = rules.reach(1.0, 2.0)
+        near = np.maximum(np.abs(row), np.abs(column)) <= reach
+        assert near.sum() < 0.9 * len(near)
+        whole, part = (
+            wide_roofs.level_below_roofs(column[of], row[of], z.ravel()[of], wanted, 1.0, 2.0)
+            for of in (slice(None), near)
+        )
+    assert np.array_equal(whole, part)
 
 
 def test_a_wide_roof_at_the_clouds_end_is_unknown():
