@@ -286,7 +286,7 @@ ROWS: dict[str, dict[str, Row]] = {
         "without wide roofs": Row(smrf, "level_below_roofs", no_wide_roofs),
         **{
             f"wide roofs: {share:.0%} of an outline are steps": Row(
-                wide_roofs, "RULES", replace(wide_roofs.RULES, share=share)
+                wide_roofs, "RULES", replace(wide_roofs.RULES, min_step_share=share)
             )
             for share in (0.5, 0.7, 0.85)
         },

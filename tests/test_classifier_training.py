@@ -174,6 +174,7 @@ def test_several_clouds_are_sampled_together_but_are_not_neighbors():
     [
         (lambda label: label, {"classes": [2, 9]}, r"class 9 .* has no samples .*2: "),
         (np.ones_like, {}, r"at least two classes .*1: 500"),
+        (lambda label: label, {"folds": 1}, r"one fold .*0 for no score"),
         (lambda label: label[:-1], {}, "one label per point"),
         (lambda label: np.full_like(label, 7), {}, r"no points to train on.* 7, 18 are left out"),
     ],

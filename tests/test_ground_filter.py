@@ -246,7 +246,7 @@ def test_wide_roofs_need_no_points_beyond_their_reach(seed):
     z = np.kron(coarse, np.ones((5, 5))) + rng.choice([0.0, 9.0], (150, 150), p=[0.99, 0.01])
     row, column = (at.ravel() - 75 for at in np.indices(z.shape))
     wanted = GridWindow(-2, -2, 4, 4)
-    rules = wide_roofs.WideRoofRules(side=1.0, radius=9.0, longest=16.0, gap=1.0)
+    rules = wide_roofs.WideRoofRules(side_m=1.0, radius_m=9.0, max_extent_m=16.0, gap_m=1.0)
     with mock.patch.object(wide_roofs, "RULES", rules):
         reach = rules.reach(1.0, 2.0)
         near = np.maximum(np.abs(row), np.abs(column)) <= reach

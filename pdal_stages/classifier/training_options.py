@@ -237,6 +237,12 @@ class TrainingOptions(Settings):
             passes=passes if self.passes is None else self.passes,
             context=Context.parse(context if self.context is None else self.context).tokens,
         )
+        if self.folds == 1:
+            raise OptionError(
+                "one fold would hold out all samples",
+                found="folds 1",
+                cure="Use at least 2 folds, or 0 for no score",
+            )
         if self.passes > 1 and not self.context:
             raise OptionError(
                 "several passes need a context", found="an empty list", cure="Leave 'context' out"

@@ -173,7 +173,8 @@ def _filtered_pieces(points: GroundPoints, options: FilterOptions) -> Iterator[_
     """Yield pieces of the cloud with the ground that the filter finds."""
     for rows, core in patches(points.column, points.row, options.reach_of_points, options.link):
         part, near = points.take(rows), None
-        if not isinstance(core, slice):  # points farther away only tell which cells are ground
+        # Points farther away only tell which cells are ground.
+        if not isinstance(rows, slice) and not isinstance(core, slice):
             near = GridWindow.enclosing(part.column[core], part.row[core])
             near = near.padded(options.reach_of_points - options.reach)
             seen = near.contains(part.column, part.row)

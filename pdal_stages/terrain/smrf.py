@@ -186,7 +186,9 @@ class FilterOptions:
         No step of the filter sees from a point to another across more empty land.
         """
         openings = max([self.radius, *self.requested_radii]) + 2 * FILL_RINGS
-        wide = WIDE_ROOFS.joined(self.cell) * (WIDE_ROOFS.cells(WIDE_ROOFS.radius, self.cell) + 1)
+        wide = WIDE_ROOFS.cells_per_side(self.cell) * (
+            WIDE_ROOFS.cells(WIDE_ROOFS.radius_m, self.cell) + 1
+        )
         return max(outlier_reach(self.cell), openings, planes_reach(self.levels(FAR)), wide) + RIM
 
 
@@ -256,7 +258,7 @@ def ground_raster(
     seen = GroundPoints._make(np.concatenate(pair) for pair in pairs)
     land = level_below_roofs(seen.column, seen.row, seen.z, window, cell, options.window)
     roofs = np.isfinite(heights) & ~objects
-    roofs[roofs] = heights[roofs] - land[roofs] > WIDE_ROOFS.height
+    roofs[roofs] = heights[roofs] - land[roofs] > WIDE_ROOFS.min_height_m
     objects |= roofs
     floor[roofs] = land[roofs]
     part = kept.slices_in(window)

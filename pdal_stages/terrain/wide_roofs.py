@@ -23,29 +23,29 @@ class WideRoofRules:
     """Thresholds of wide roofs. What they are worth is in docs/results/ablation.md."""
 
     #: Side of the coarse cells in meters: with 4 m, slopes of the land look like steps.
-    side: float = 2.0
-    radius: float = 110.0  #: half the width of the widest roof, in meters
-    longest: float = 250.0  #: extent of the longest roof along either axis, in meters
+    side_m: float = 2.0
+    radius_m: float = 110.0  #: half the width of the widest roof, in meters
+    max_extent_m: float = 250.0  #: extent of the longest roof along either axis, in meters
     #: Half the width in meters of pits and moats that are filled: land within a moat is no roof.
-    gap: float = 8.0
-    height: float = 2.0  #: least height above the land around, in meters
+    gap_m: float = 8.0
+    min_height_m: float = 2.0  #: least height above the land around, in meters
     #: Height in meters of a step. With 2 m half of the wide roofs of a thin cloud are lost.
-    step: float = 1.5
+    min_step_m: float = 1.5
     #: Least share of a roof's outline that is a step: trees or annexes may stand beside the rest.
-    share: float = 0.6
+    min_step_share: float = 0.6
 
     def cells(self, length: float, cell: float) -> int:
         """Return a length in coarse cells."""
-        return max(1, round(length / (self.joined(cell) * cell)))
+        return max(1, round(length / (self.cells_per_side(cell) * cell)))
 
-    def joined(self, cell: float) -> int:
-        """Return how many cells of the ground filter, along either axis, make a coarse one."""
-        return max(1, round(self.side / cell))
+    def cells_per_side(self, cell: float) -> int:
+        """Return how many cells of the ground filter lie along the side of a coarse one."""
+        return max(1, round(self.side_m / cell))
 
     def reach(self, cell: float, window: float) -> int:
         """Return how far away, in cells of the filter, points change what is a wide roof."""
-        far = 2 * self.radius + self.longest + 2 * window + 2 * self.gap
-        return (self.cells(far, cell) + FILL_RINGS + 6) * self.joined(cell)
+        far = 2 * self.radius_m + self.max_extent_m + 2 * window + 2 * self.gap_m
+        return (self.cells(far, cell) + FILL_RINGS + 6) * self.cells_per_side(cell)
 
 
 RULES = WideRoofRules()
@@ -72,28 +72,18 @@ def level_below_roofs(
     cell, window : float
         Side of a cell, and radius of the filter's largest window, in meters.
     """
-    out, joined = np.full(wanted.shape, HOLE), RULES.joined(cell)
     if not len(z):
-        return out
-    around = GridWindow.enclosing(*(_ends(axis, joined) for axis in (column, row)))
-    around = around.padded(FILL_RINGS + 1)
-    lowest = np.full(around.width * around.height, HOLE)
-    np.minimum.at(lowest, around.flat_index(column // joined, row // joined), z)
-    level = _coarse_levels(lowest.reshape(around.shape).astype(np.float32), cell, window)
-    rows, columns = (np.arange(n) for n in wanted.shape)
-    rows = (rows + wanted.bottom) // joined - around.bottom
-    columns = (columns + wanted.left) // joined - around.left
-    inside_rows, inside_columns = (
-        (at >= 0) & (at < n) for at, n in zip((rows, columns), around.shape, strict=True)
-    )
-    found = level[np.ix_(rows[inside_rows], columns[inside_columns])]
-    out[np.ix_(inside_rows, inside_columns)] = found
-    return out
-
-
-def _ends(numbers: NDArray[np.int64], joined: int) -> NDArray[np.int64]:
-    """Return the first and last coarse cell along an axis."""
-    return np.array([numbers.min(), numbers.max()]) // joined
+        return np.full(wanted.shape, HOLE)
+    joined = RULES.cells_per_side(cell)
+    columns = (np.arange(wanted.width) + wanted.left) // joined
+    rows = (np.arange(wanted.height) + wanted.bottom) // joined
+    column, row = column // joined, row // joined
+    raster_window = GridWindow.enclosing(np.append(column, columns), np.append(row, rows))
+    raster_window = raster_window.padded(FILL_RINGS + 1)
+    lowest = np.full(raster_window.shape, HOLE)
+    np.minimum.at(lowest.ravel(), raster_window.flat_index(column, row), z)
+    level = _coarse_levels(lowest, cell, window)
+    return level[np.ix_(rows - raster_window.bottom, columns - raster_window.left)]
 
 
 def _coarse_levels(lowest: NDArray[np.float32], cell: float, window: float) -> NDArray[np.float32]:
@@ -105,17 +95,18 @@ def _coarse_levels(lowest: NDArray[np.float32], cell: float, window: float) -> N
     filled = fill_holes(lowest)
     known = filled != HOLE
     plain = _dilated(_eroded(filled, known, cells(window)), known, cells(window))
-    plain = _eroded(_dilated(plain, known, cells(RULES.gap)), known, cells(RULES.gap))
-    level = _dilated(_eroded(plain, known, cells(RULES.radius)), known, cells(RULES.radius))
+    plain = _eroded(_dilated(plain, known, cells(RULES.gap_m)), known, cells(RULES.gap_m))
+    level = _dilated(_eroded(plain, known, cells(RULES.radius_m)), known, cells(RULES.radius_m))
     above = np.zeros(known.shape, bool)
-    above[known] = plain[known] - level[known] > RULES.height
+    above[known] = plain[known] - level[known] > RULES.min_height_m
     outline = above & highest_around(~above, 1, 0)
     below = -highest_around(np.where(known & ~above, -plain, -HOLE), 1, 0)
-    stepped = outline & (below <= plain - RULES.step)
+    stepped = outline & (below <= plain - RULES.min_step_m)
     flat = np.where(above, np.float32(0), HOLE)
     number, sizes, longest = linked_cells(flat, 1.5, np.ones_like)  # corners touch
-    steps, rim = (np.bincount(number[of], minlength=len(sizes)) for of in (stepped, outline))
-    roofs = (steps >= RULES.share * rim) & (longest < cells(RULES.longest))
+    rims = np.bincount(number[outline], minlength=len(sizes))
+    steps = np.bincount(number[stepped], minlength=len(sizes))
+    roofs = (steps >= RULES.min_step_share * rims) & (longest < cells(RULES.max_extent_m))
     above[above] = roofs[number[above]]
     return -highest_around(np.where(above, -level, -HOLE), 1, 0)
 
