@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from clouds import Cloud, load, one_return, thinned, without_returns
-from surveys import FEW, SURVEYS
+from surveys import BUILDING, FEW, GROUND, SHRUBS, SURVEYS, VEGETATION
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.base.hashing import hash_rows
@@ -27,6 +27,8 @@ BELOW = 0.3
 MOST = 45_000
 #: The same of surveys that give few samples.
 MOST_OF_FEW = 16_000
+#: Samples of shrubs from each copy, at most (not tuned).
+SHRUB_SAMPLES = 250
 OPTIONS = TrainingOptions(
     neighborhoods="s5,k10,k20,k50",
     feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest,"
@@ -38,7 +40,7 @@ OPTIONS = TrainingOptions(
         "HeightAboveOpening_17",
         "returns",
     ),
-    classes={"2": 2, "5": 5, "6": 6},
+    classes={"2": 2, "3,5": 5, "6": 6},
     count=40_000,
     trees=40,
     max_samples=1.0,
@@ -87,8 +89,9 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
         cloud.xyz, cloud.labels, cloud.dimensions, name=cloud.name, survey=cloud.survey
     )
     usable = np.where(contradicted(cloud), 0, cloud.labels)
-    for code in (2, 5, 6):
-        mask[order[usable[order] == code][: SURVEYS[cloud.survey].samples]] = True
+    samples = dict.fromkeys((GROUND, VEGETATION, BUILDING), SURVEYS[cloud.survey].samples)
+    for code, most in {**samples, SHRUBS: SHRUB_SAMPLES}.items():
+        mask[order[usable[order] == code][:most]] = True
     return replace(whole, mask=mask)
 
 

@@ -2,7 +2,8 @@
 
 Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring.
 Low vegetation (3) is left out: in these surveys most of it lies on the ground, and where it begins
-is a matter of taste.
+is a matter of taste. 3 stands for shrubs that :func:`clouds.find_shrubs` finds among everything
+else; they are trained on as vegetation and not scored.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 GROUND, VEGETATION, BUILDING = 2, 5, 6
+SHRUBS = 3
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class LabeledSurvey:
         That holds the codes.
     low : mapping
         Codes of everything else: ground below a height in meters.
+    shrubs : tuple of int
+        Codes of everything else that shrubs are looked for in.
     tall_scored : bool
         Whether that is true enough to score by, or to train on only.
     returns : bool
@@ -59,6 +63,7 @@ class LabeledSurvey:
     tall: Mapping[int, float] = field(default_factory=dict)
     dimension: str = "classification"
     low: Mapping[int, float] = field(default_factory=dict)
+    shrubs: tuple[int, ...] = ()
     tall_scored: bool = False
     returns: bool = True
     samples: int = 1500
@@ -107,6 +112,7 @@ SURVEYS = {
         group=DUTCH,
         dropped=(7, 18, 26),
         tall={1: 2.0},
+        shrubs=(1,),
     ),
     "Seville": LabeledSurvey(
         ("seville/plazanueva.laz",),
@@ -191,6 +197,7 @@ SURVEYS = {
         FARMLAND,
         group=DUTCH,
         tall={1: 2.0},
+        shrubs=(1,),
         tall_scored=True,
         samples=FEW,
     ),
@@ -211,6 +218,7 @@ SURVEYS = {
         TOWN,
         group=DUTCH,
         tall={1: 2.0},
+        shrubs=(1,),
         tall_scored=True,
     ),
     "gardens": LabeledSurvey(
@@ -221,6 +229,7 @@ SURVEYS = {
         TOWN,
         group=DUTCH,
         tall={1: 2.5},
+        shrubs=(1,),
         tall_scored=True,
     ),
     "park": LabeledSurvey(
@@ -231,6 +240,7 @@ SURVEYS = {
         TOWN,
         group=DUTCH,
         tall={1: 2.0},
+        shrubs=(1,),
         tall_scored=True,
         samples=FEW,
     ),
@@ -241,6 +251,7 @@ SURVEYS = {
         _AHN,
         TOWN,
         group=DUTCH,
+        shrubs=(1,),
         samples=FEW,
     ),
     "small town": LabeledSurvey(
