@@ -30,7 +30,7 @@ MOST_OF_FEW = 16_000
 #: Samples of shrubs from each copy, at most (not tuned).
 SHRUB_SAMPLES = 250
 OPTIONS = TrainingOptions(
-    neighborhoods="k10,k20,k50",
+    neighborhoods="k20,k50",
     feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest,"
     "NormalAgreement_k20,SurfaceVariationMin_k20",
     dimensions=(
