@@ -26,6 +26,8 @@ from .smrf import (
 )
 from .surface import GroundRaster, cells_around, heights_above, surface
 from .surface import reach as planes_reach
+from .wide_roofs import RULES as WIDE_ROOFS
+from .wide_roofs import lowest_of_coarse_cells
 
 #: Side of a block in cells: larger ones take more memory, smaller ones more time; not tuned.
 BLOCK_SIDE = 1024
@@ -152,7 +154,7 @@ def cells_of_block(
     # Openings reach into cells without points.
     spill = max([*options.requested_radii, 0]) + FILL_RINGS + RIM
     margin = max(spill, _reach_of_ground(options))
-    low = _in_cells(outer, options)
+    low = _in_cells(_thinned_far_away(outer, core.padded(margin), options), options)
     if not core.padded(margin).contains(low.column, low.row).any():
         return GroundCells.of_blocks([], len(options.openings))
     raster = ground_raster(low, options, margin=spill, wanted=core.padded(margin))
@@ -164,6 +166,25 @@ def cells_of_block(
     raster, planes = raster.cut(kept), planes[kept.slices_in(raster.window)].copy()
     means = ground_means(_judged(points, planes, kept, options), options.cell, kept)
     return GroundCells(_records(raster, core, means, options.requested_radii))
+
+
+def _thinned_far_away(
+    lowest: NDArray[np.float64], wanted: GridWindow, options: FilterOptions
+) -> NDArray[np.float64]:
+    """Return the lowest points (n, 3) near wanted cells, and far away those of coarse cells alone.
+
+    This halves the memory of a block.
+    """
+    coarse = WIDE_ROOFS.cells_per_side(options.cell)
+    near = wanted.padded(options.reach_of_raster)
+    left, bottom = near.left // coarse * coarse, near.bottom // coarse * coarse
+    right, top = near.left + near.width, near.bottom + near.height
+    inside = np.ones(len(lowest), bool)
+    for axis, first, end in ((0, left, right), (1, bottom, top)):
+        number = cell_numbers(lowest[:, axis], options.cell)
+        inside &= (number >= first) & (number < -(-end // coarse) * coarse)
+    far = lowest_of_coarse_cells(lowest[~inside], options.cell)
+    return np.concatenate([lowest[inside], far])
 
 
 def _in_cells(xyz: NDArray[np.float64], options: FilterOptions) -> GroundPoints:

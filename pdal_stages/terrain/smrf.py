@@ -145,6 +145,15 @@ class FilterOptions:
         return max(wide, self.reach_of_openings) + ROUNDS * self.round_reach + RIM
 
     @property
+    def reach_of_raster(self) -> int:
+        """Distance in cells within which all lowest points are needed, not those of coarse cells.
+
+        A coarse cell more, so that none is cut.
+        """
+        coarse = WIDE_ROOFS.cells_per_side(self.cell)
+        return ROUNDS * self.round_reach + self.reach_of_openings + RIM + coarse
+
+    @property
     def reach_of_openings(self) -> int:
         """Distance in cells within which lowest points change openings."""
         openings = 2 * max([self.radius, *self.requested_radii]) + 2 * FILL_RINGS
@@ -245,18 +254,17 @@ def ground_raster(
     window, cell = GridWindow.enclosing(points.column, points.row).padded(margin), options.cell
     wanted = wanted or window
     kept = wanted.padded(ROUNDS * options.round_reach).intersect(window)
-    whole, window = window, kept.padded(options.reach_of_openings + RIM).intersect(window)
-    far = points.take(slice(0))
-    if window != whole:
-        inside = window.contains(points.column, points.row)
-        far, points = points.take(points.use & ~inside), points.take(inside)
+    window = kept.padded(options.reach_of_openings + RIM).intersect(window)
+    inside = window.contains(points.column, points.row)
+    far = np.flatnonzero(points.use & ~inside)
+    points = points._replace(use=points.use & inside)
     lowest, heights = minimum_grid(points, window, cell)
     objects, floor, opened = objects_of(
         heights, cell, options.slope, options.radius, options.requested_radii
     )
-    pairs = zip(points.take(lowest[lowest >= 0]), far, strict=True)
-    seen = GroundPoints._make(np.concatenate(pair) for pair in pairs)
-    land = level_below_roofs(seen.column, seen.row, seen.z, window, cell, options.window)
+    seen = np.append(lowest[lowest >= 0], far)
+    cells = points.column[seen], points.row[seen]
+    land = level_below_roofs(*cells, points.z[seen], window, cell, options.window)
     roofs = np.isfinite(heights) & ~objects
     roofs[roofs] = heights[roofs] - land[roofs] > WIDE_ROOFS.min_height_m
     objects |= roofs

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.grid import GridWindow
+from ..base.grid import GridWindow, cell_numbers
 from .cells import HOLE
 from .components import linked_cells
 from .openings import FILL_RINGS, fill_holes, highest_around, octagon
@@ -49,6 +49,23 @@ class WideRoofRules:
 
 
 RULES = WideRoofRules()
+
+
+def lowest_of_coarse_cells(xyz: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
+    """Return the lowest points (m, 3) of coarse cells, each in the middle of its cell.
+
+    They stand for all points (n, 3) so far away that only wide roofs depend on them.
+    """
+    if not len(xyz):
+        return xyz
+    joined = RULES.cells_per_side(cell)
+    column, row = (cell_numbers(axis, cell) // joined for axis in xyz.T[:2])
+    window = GridWindow.enclosing(column, row)
+    lowest = np.full(window.shape, np.inf)
+    np.minimum.at(lowest.ravel(), window.flat_index(column, row), xyz[:, 2])
+    j, i = np.nonzero(np.isfinite(lowest))
+    middle = np.column_stack([i + window.left, j + window.bottom]) + 0.5
+    return np.column_stack([middle * (joined * cell), lowest[j, i]])
 
 
 def level_below_roofs(

@@ -121,7 +121,7 @@ FILE_POINT = 250
 #: Bytes that our stages take for blocks of points, at most by default.
 STAGES = 512 << 20
 #: Bytes of a raster cell of a block of a far-reaching stage.
-_CELL = 200
+_CELL = 110
 #: Larger output files are assembled in parts of this many points, so that memory does not grow with
 #: the file.
 MOST_AT_ONCE = 4_000_000
