@@ -35,12 +35,11 @@ def growing_radii(largest: int) -> list[int]:
     return sorted({*radii, largest})
 
 
-def octagon(radius: int, shape: tuple[int, ...]) -> tuple[int, int]:
+def _steps(radius: int) -> tuple[int, int]:
     """Return the numbers of squares and diamonds of radius 1 that add up to an octagon.
 
-    tan(22.5 degrees) of them are squares. A raster's `shape` bounds the radius.
+    tan(22.5 degrees) of them are squares.
     """
-    radius = min(radius, sum(shape))
     squares = int(0.41421356 * radius)
     return squares, radius - squares
 
@@ -140,7 +139,7 @@ def openings_of(
     lowest_upended = np.where(raster != HOLE, -raster, -HOLE)
     done = 0, 0
     for radius in sorted(radii):
-        squares, diamonds = octagon(radius, raster.shape)
+        squares, diamonds = _steps(min(radius, sum(raster.shape)))
         lowest_upended = highest_around(lowest_upended, squares - done[0], diamonds - done[1])
         done = squares, diamonds
         yield radius, highest_around(np.minimum(-lowest_upended, ceiling), squares, diamonds)

@@ -146,12 +146,8 @@ class FilterOptions:
 
     @property
     def reach_of_raster(self) -> int:
-        """Distance in cells within which all lowest points are needed, not those of coarse cells.
-
-        A coarse cell more, so that none is cut.
-        """
-        coarse = WIDE_ROOFS.cells_per_side(self.cell)
-        return ROUNDS * self.round_reach + self.reach_of_openings + RIM + coarse
+        """Distance in cells within which all lowest points matter, beyond it the coarse cells'."""
+        return ROUNDS * self.round_reach + self.reach_of_openings + RIM
 
     @property
     def reach_of_openings(self) -> int:
@@ -254,7 +250,7 @@ def ground_raster(
     window, cell = GridWindow.enclosing(points.column, points.row).padded(margin), options.cell
     wanted = wanted or window
     kept = wanted.padded(ROUNDS * options.round_reach).intersect(window)
-    window = kept.padded(options.reach_of_openings + RIM).intersect(window)
+    window = wanted.padded(options.reach_of_raster).intersect(window)
     inside = window.contains(points.column, points.row)
     far = np.flatnonzero(points.use & ~inside)
     points = points._replace(use=points.use & inside)
