@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import OptionError, StageError, suggest
-from .grid import cell_numbers
+from .grid import compact_keys, places_among
 
 #: Names users write, in meters.
 NAMED = {
@@ -101,15 +100,13 @@ def median_slope(xyz_m: NDArray, height_m: NDArray, limits: UnitDoubts = UnitDou
     in meters.
     """
     sample = slice(None, None, 1 + len(xyz_m) // limits.most_points)
-    column, row = cell_numbers(xyz_m[sample, :2].T, limits.cell_m)
-    cells, inverse = np.unique(np.column_stack([column, row]), axis=0, return_inverse=True)
+    cells, lines = compact_keys(xyz_m[sample, :2], limits.cell_m)
+    cells, inverse = np.unique(cells, return_inverse=True)
     terrain = np.bincount(inverse, xyz_m[sample, 2] - height_m[sample]) / np.bincount(inverse)
-    by_place = dict(zip(map(tuple, cells.tolist()), terrain.tolist(), strict=True))
-    slopes = [
-        math.hypot(by_place[x + 1, y] - height, by_place[x, y + 1] - height) / limits.cell_m
-        for (x, y), height in by_place.items()
-        if (x + 1, y) in by_place and (x, y + 1) in by_place
-    ]
+    east, has_east = places_among(cells, cells + 1)
+    north, has_north = places_among(cells, cells + lines[-1])
+    slopes = np.hypot(terrain[east] - terrain, terrain[north] - terrain) / limits.cell_m
+    slopes = slopes[has_east & has_north]
     return float(np.median(slopes)) if len(slopes) >= limits.least_cells else 0.0
 
 
