@@ -150,12 +150,9 @@ def blocks_of(points, options, near):
             )
             seen = (low[0] >= box[0]) & (low[0] <= box[2]) & (low[1] >= box[1]) & (low[1] <= box[3])
             members = inside.get((i, j), np.empty((0, 3)))
-            results.append(
-                cells_of_block(
-                    low[:, seen].T, (i, j), options, [members[::2], members[1::2]]
-                ).in_parts(256)
-            )
-    return GroundCells.of_blocks(results, len(options.openings))
+            parts = [members[::2], members[1::2]]
+            results.append(cells_of_block(low[:, seen].T, (i, j), options, parts))
+    return GroundCells(results)
 
 
 def test_thousands_of_lone_points_are_refused_before_any_of_them_is_worked_on(tmp_path, write_las):

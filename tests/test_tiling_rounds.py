@@ -61,16 +61,11 @@ class LowestFar(FarReaching):
         rows = [[*block, points[:, 2].min()]] if len(points) else np.empty((0, 3))
         return {"lowest": np.array(rows)}
 
-    def arrays_in(self, box):
-        return {"lowest"}
-
-    def join_blocks(self, blocks):
-        rows = np.concatenate([arrays["lowest"] for arrays in blocks])
-        return {(int(i), int(j)): z for i, j, z in rows}
-
     def run(self, points, context):
         x, y, z = points.axes
-        low = context.blocks or {at: xyz[0, 2] for at, xyz in lowest(x, y, z).items()}
+        low = {at: xyz[0, 2] for at, xyz in lowest(x, y, z).items()}
+        for block in context.blocks or ():
+            low |= {(int(i), int(j)): z for i, j, z in block["lowest"]}
         squares = zip((x // SIDE).astype(int).tolist(), (y // SIDE).astype(int).tolist())
         heights = z - np.array([low[at] for at in squares])
         return {

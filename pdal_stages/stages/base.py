@@ -57,7 +57,7 @@ class StageContext:
     used_m: float = 0.0
     #: In a tile: the blocks that an earlier round left for a stage that reaches far
     #: (:class:`FarReaching`).
-    blocks: Any = None
+    blocks: Sequence[Mapping[str, NDArray]] | None = None
 
     def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_] | None:
         """Return which points (n,) have results that are used; None outside tiles: all."""
@@ -372,8 +372,8 @@ class FarReaching(Stage):
     """A stage that looks too far for the surroundings of a tile: a round before serves it.
 
     The points of each tile are reduced to what matters far away (:meth:`reduce_points`), blocks of
-    a grid are computed from that (:meth:`compute_block`), and a tile joins the parts of the blocks
-    that it needs (:meth:`join_blocks`).
+    a grid are computed from that (:meth:`compute_block`), and a tile reads what it needs of those
+    around it (:attr:`StageContext.blocks`).
     """
 
     @abstractmethod
@@ -392,11 +392,3 @@ class FarReaching(Stage):
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
         """Compute a block (column, row) from the reduced points around and in it."""
-
-    @abstractmethod
-    def arrays_in(self, box: Sequence[float]) -> set[str]:
-        """Return names of arrays that a box (min x, min y, max x, max y, meters) needs."""
-
-    @abstractmethod
-    def join_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> Any:
-        """Join these arrays of the blocks that a box touches to :attr:`StageContext.blocks`."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,6 @@ from .points import Points
 
 #: The options of the filter.
 _FILTER = ("cell", "slope", "window", "threshold", "scalar", "openings")
-#: Cells along the side of squares of a block that a tile reads by themselves.
-_PART = 256
 
 
 class HagMorphological(FarReaching):
@@ -135,16 +132,8 @@ class HagMorphological(FarReaching):
         inside: Iterable[NDArray[np.float64]],
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
-        """Compute the cells of a block, in squares that tiles read by themselves."""
-        return cells_of_block(far_points, block, self._filter, inside).in_parts(_PART)
-
-    def arrays_in(self, box: Sequence[float]) -> set[str]:
-        """Return names of the squares that a box needs."""
-        return GroundCells.names_within(_PART, *(math.floor(side / self.cell) for side in box))
-
-    def join_blocks(self, blocks: Iterable[Mapping[str, NDArray]]) -> GroundCells:
-        """Join the squares of several blocks."""
-        return GroundCells.of_blocks(blocks, len(self.openings))
+        """Compute the cells of a block, in squares."""
+        return cells_of_block(far_points, block, self._filter, inside)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Find the ground, or take the given one, and compute heights above it."""
@@ -163,7 +152,7 @@ class HagMorphological(FarReaching):
             mask=usable if all_wanted else usable[wanted],
             **vars(self._filter),
             threads=self.threads,
-            cells=context.blocks,
+            cells=None if context.blocks is None else GroundCells(context.blocks),
             figures=points.report.figures,
             ground=ground if ground is None or all_wanted else ground[wanted],
         )

@@ -5,9 +5,8 @@ They are computed once, from the lowest points far around and all points inside.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +30,8 @@ from .wide_roofs import lowest_of_coarse_cells
 
 #: Side of a block in cells: larger ones take more memory, smaller ones more time; not tuned.
 BLOCK_SIDE = 1024
+#: Side of the squares of a block that are read by themselves, in cells; not tuned.
+SQUARE_SIDE = 256
 
 
 def reach_of_block(options: FilterOptions) -> int:
@@ -48,54 +49,53 @@ def _reach_of_ground(options: FilterOptions) -> int:
 
 @dataclass(frozen=True)
 class GroundCells:
-    """The cells of a :class:`.surface.GroundRaster` that are not empty, as records.
+    """The cells of a :class:`.surface.GroundRaster` that are not empty, in blocks.
 
     They have a height, an opening, or ground points.
     """
 
-    cells: NDArray[np.void]  #: (n,) records, see `_record`
-
-    def in_parts(self, side: int) -> dict[str, NDArray]:
-        """Return the cells of each square of `side` columns and rows by its name, for files."""
-        column, row = (self.cells[name].astype(np.int64) // side for name in ("column", "row"))
-        parts = group_by_key(cell_keys(column, row))
-        return {f"{column[p[0]]}_{row[p[0]]}": self.cells[p] for p in parts}
-
-    @staticmethod
-    def names_within(side: int, west: int, south: int, east: int, north: int) -> set[str]:
-        """Return the names of the arrays of :meth:`in_parts` that hold these columns and rows."""
-        columns, rows = (
-            range(low // side, high // side + 1) for low, high in ((west, east), (south, north))
-        )
-        return {f"{i}_{j}" for i in columns for j in rows}
-
-    @staticmethod
-    def of_blocks(blocks: Iterable[Mapping[str, NDArray]], openings: int) -> GroundCells:
-        """Join arrays of :meth:`in_parts`, of a filter with that number of openings."""
-        parts = (part for block in blocks for part in block.values())
-        return GroundCells(np.concatenate([np.empty(0, _record(openings)), *parts]))
+    #: Each has its cells in squares of `SQUARE_SIDE` cells by their names, as records, see
+    #: `_record`. Saved ones are read when they are asked for, and not kept.
+    blocks: Sequence[Mapping[str, NDArray[np.void]]]
 
     def raster(self, window: GridWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
         """Return the raster of a window, and the means of its ground points."""
-        shape = window.height, window.width
-        cells = self.cells[window.contains(self.cells["column"], self.cells["row"])]
-        at = cells["row"] - window.bottom, cells["column"] - window.left
+        shape, record = (window.height, window.width), _record(len(radii))
+        out = {name: np.zeros((*shape, *record[name].shape), record[name].base) for name in _FILLED}
+        out["lowest"][:] = out["floor"][:] = HOLE
+        opened = {radius: np.full(shape, -np.inf, np.float32) for radius in radii}
+        squares = _squares_of(window)
+        for block in self.blocks:
+            for name in squares.intersection(block):
+                cells = block[name]
+                cells = cells[window.contains(cells["column"], cells["row"])]
+                at = cells["row"] - window.bottom, cells["column"] - window.left
+                for field, values in out.items():
+                    values[at] = cells[field]
+                for k, values in enumerate(opened.values()):
+                    values[at] = cells["opened"][:, k]
+        means = out.pop("held"), out.pop("means")
+        return GroundRaster(window, **out, opened=opened), means
 
-        def filled(name: str, value: Any, *more: int) -> NDArray:
-            out = np.full((*shape, *more), value, cells[name].dtype)
-            out[at] = cells[name]
-            return out
 
-        opened = filled("opened", -np.inf, len(radii))
-        raster = GroundRaster(
-            window,
-            filled("lowest", HOLE),
-            filled("place", 0.0, 3),
-            filled("ground", False),
-            filled("floor", HOLE),
-            {radius: np.ascontiguousarray(opened[..., k]) for k, radius in enumerate(radii)},
-        )
-        return raster, (filled("held", False), filled("means", 0.0, 3))
+#: Fields of a record that fill rasters of their own.
+_FILLED = ("lowest", "place", "ground", "floor", "held", "means")
+
+
+def _in_squares(cells: NDArray[np.void]) -> dict[str, NDArray[np.void]]:
+    """Return records (n,) of cells by the name of the square that holds them."""
+    column, row = (cells[name].astype(np.int64) // SQUARE_SIDE for name in ("column", "row"))
+    squares = group_by_key(cell_keys(column, row))
+    return {f"{column[s[0]]}_{row[s[0]]}": cells[s] for s in squares}
+
+
+def _squares_of(window: GridWindow) -> set[str]:
+    """Return the names of the squares that hold cells of a window."""
+    columns, rows = (
+        range(first // SQUARE_SIDE, (first + count - 1) // SQUARE_SIDE + 1)
+        for first, count in ((window.left, window.width), (window.bottom, window.height))
+    )
+    return {f"{i}_{j}" for i in columns for j in rows}
 
 
 def _record(openings: int) -> np.dtype:
@@ -143,8 +143,10 @@ def cells_of_block(
     block: tuple[int, int],
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
-) -> GroundCells:
+) -> dict[str, NDArray[np.void]]:
     """Compute the cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
+
+    They are one of the blocks of a :class:`GroundCells`.
 
     `outer` are the lowest points (n, 3) of :func:`reduced_points`: all within
     :func:`reach_of_block` cells of the block, and few more. `points` are all that may be ground in
@@ -156,7 +158,7 @@ def cells_of_block(
     margin = max(spill, _reach_of_ground(options))
     low = _in_cells(_thinned_far_away(outer, core.padded(margin), options), options)
     if not core.padded(margin).contains(low.column, low.row).any():
-        return GroundCells.of_blocks([], len(options.openings))
+        return {}
     raster = ground_raster(low, options, margin=spill, wanted=core.padded(margin))
     inside = low.take(core.contains(low.column, low.row))
     needed = cells_around(raster.window, inside.column, inside.row)
@@ -165,7 +167,7 @@ def cells_of_block(
     kept = core.padded(1).intersect(raster.window)
     raster, planes = raster.cut(kept), planes[kept.slices_in(raster.window)].copy()
     means = ground_means(_judged(points, planes, kept, options), options.cell, kept)
-    return GroundCells(_records(raster, core, means, options.requested_radii))
+    return _in_squares(_records(raster, core, means, options.requested_radii))
 
 
 def _thinned_far_away(

@@ -11,7 +11,7 @@ import shutil
 import socket
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -316,9 +316,40 @@ def load_arrays(path: str | Path, only: Collection[str] | None = None) -> dict[s
 
     A file that cannot be read is removed, so that a later run makes it again.
     """
+    with _opened(path) as file:
+        return {name: file[name] for name in file.files if only is None or name in only}
+
+
+class SavedArrays(Mapping[str, NDArray]):
+    """The arrays of a file by name, each of which is read when it is asked for, and not kept."""
+
+    def __init__(self, path: str | Path) -> None:
+        """Read the names; StageError as of :func:`load_arrays`, here and later."""
+        self._path = path
+        with _opened(path) as file:
+            self._names = file.files
+
+    def __getitem__(self, name: str) -> NDArray:
+        """Return an array."""
+        if name not in self._names:
+            raise KeyError(name)
+        return load_arrays(self._path, [name])[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        """Return how many arrays there are."""
+        return len(self._names)
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path) -> Iterator[Any]:
+    """Open a file of arrays; one that cannot be read is removed."""
     try:
         with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files if only is None or name in only}
+            yield file
     except MemoryError:
         raise
     except Exception as error:  # zipfile and numpy raise many types

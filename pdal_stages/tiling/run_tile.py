@@ -34,7 +34,7 @@ from ..stages.base import WHOLE_CLOUD, FarReaching, inside_block
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
 from ..stages.registry import stage_types
 from .inputs import InputSource
-from .jobs import load_arrays, save_arrays, written
+from .jobs import SavedArrays, load_arrays, save_arrays, written
 from .options import Box, TileGrid, inside
 from .plan import INPUT, OUTSIDE, ROW, RunContext
 from .sorted_points import Piece, cut_all
@@ -128,14 +128,12 @@ def _box_m(context: RunContext, box: Box, distance_m: float) -> Box:
     return (x0 - distance_m, y0 - distance_m, x1 + distance_m, y1 + distance_m)
 
 
-def load_blocks(context: RunContext, box: Box, read_m: float) -> Any:
-    """Load the blocks for a tile (its box) that is read with some meters around it."""
+def load_blocks(context: RunContext, box: Box, read_m: float) -> list[SavedArrays]:
+    """Return the blocks for a tile (its box) that is read with some meters around it."""
     assert context.plan.blocks is not None
     distance_m = read_m + context.plan.blocks.margin + context.plan.blocks.spill
-    stage = far_reaching(context)
-    needed = stage.arrays_in(_box_m(context, box, distance_m))
     names = map(block_name, blocks_near(context, box, distance_m))
-    return stage.join_blocks(load_arrays(path, needed) for path in _existing(context.kept, names))
+    return [SavedArrays(path) for path in _existing(context.kept, names)]
 
 
 def load_changes(
