@@ -100,7 +100,7 @@ class ThisProcess(AbstractContextManager):
         with deferred_interrupts():
             future.set_result(perform_task(task))
             check_interrupt()
-        gc.collect()  # a command seldom collects: 4 MB and the points of each tile stayed
+        gc.collect(1)  # a command seldom collects: 4 MB and the points of each tile stayed
         return future
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
