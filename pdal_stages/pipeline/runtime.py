@@ -244,7 +244,7 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
     if isinstance(error, StageError):
         return error.at(where)
     if isinstance(error, MemoryError):
-        cure = "Lower 'memory' or 'memory_mb', take fewer points, or work in tiles (--tile)"
+        cure = "Lower 'memory_mb', take fewer points, or work in tiles (--tile)"
         return StageError("memory ran out", where=where, cure=cure)
     if isinstance(error, KeyboardInterrupt):
         return InterruptedStage("interrupted", where=where)

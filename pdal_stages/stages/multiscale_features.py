@@ -55,7 +55,7 @@ class MultiscaleFeatures(Stage):
         "otherwise fitted to these points and written, so that other clouds can use the same ones",
     )
     ignore: Selection = ignore_option("Points left out, even as neighbors: they get no features")
-    memory: int = option(
+    memory_mb: int = option(
         *("integer", 512, "Memory for blocks of points, in addition to the cloud itself", 16),
         unit="MB",
     )
@@ -124,7 +124,7 @@ class MultiscaleFeatures(Stage):
         columns = [plan.names.index(name) for name in names]
         out = {name: np.array(points.arrays[name]) for name in self.creates()}
         with Progress(total, self.type) as progress:
-            run = engine.run(queries, dimensions=inputs, memory_mb=self.memory)
+            run = engine.run(queries, dimensions=inputs, memory_mb=self.memory_mb)
             for block in run.computed():
                 progress.update(len(block.rows))
                 rows = there[block.rows]
