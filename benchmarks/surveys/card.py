@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from leave_one_out import NAMES, at, group_table, survey_table
-from recipe import BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS
+from recipe import ABOVE, BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS
 from sources import SOURCES
 from surveys import GROUPS, SURVEYS
 
@@ -86,7 +86,6 @@ def pages() -> dict[Path, str]:
         "stage": as_json(PREPARATION),
         "passes": OPTIONS.passes,
         "trees": OPTIONS.trees,
-        "fewer": scores["trees"],
         "voxel": OPTIONS.voxel,
         "size": MODEL.stat().st_size / 1e6,
         "digest": hashlib.sha256(MODEL.read_bytes()).hexdigest()[:16],
@@ -99,6 +98,7 @@ def pages() -> dict[Path, str]:
         "surveys": survey_list(runs),
         "count": OPTIONS.count,
         "most": MOST,
+        "above": ABOVE,
         "below": BELOW,
         "densities": ", ".join(f"{density:g}" for density in DENSITIES),
         "one_return": " and ".join(f"{density:g}" for density in ONE_RETURN),

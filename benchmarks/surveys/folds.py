@@ -29,8 +29,6 @@ from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import FOLD_TREES, feature_plan
 from pdal_stages.classifier.training_clouds import label_classes
 
-#: Trees of a forest of a model that judges: fewer than the shipped one's, for speed.
-TREES = 16
 #: Parts of the surveys that are left out in turn for the votes that a later pass reads.
 VOTE_FOLDS = 5
 FEATURES = Features(feature_plan(OPTIONS))
@@ -85,7 +83,7 @@ class GroupsLeftOut:
             if number:
                 votes = self._vote(group, values, votes)
                 values = np.concatenate([self.values, self._context_of_samples(votes)], axis=1)
-            forest = self._grow(values, kept, TREES)
+            forest = self._grow(values, kept, OPTIONS.trees)
             passes.append(FeatureForest(FEATURES, forest, CONTEXT if number else None))
         # The shipped model is of the same make; its counts of samples are replaced.
         info = {**copy.deepcopy(load_model("standard").info), "training": self._training(group)}
@@ -106,7 +104,7 @@ class GroupsLeftOut:
         `values` are what the pass reads of the samples, `before` the votes of the pass before it,
         if there is one.
         """
-        votes, trees = {}, max(1, round(FOLD_TREES * TREES))
+        votes, trees = {}, max(1, round(FOLD_TREES * OPTIONS.trees))
         sampled = np.unique(self.samples.cloud[self.group != group])
         for fold in np.unique(self.fold_of[sampled]).tolist():
             forest = self._grow(values, (self.group != group) & (self.fold != fold), trees)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from clouds import Cloud, load, slug, thinned
-from folds import TREES, GroupsLeftOut
+from folds import GroupsLeftOut
 from recipe import contradicted
 from surveys import (
     BUILDING,
@@ -221,7 +221,7 @@ def main() -> None:
                         draw(found.classification, one, args.pictures)
     print(group_table(runs), survey_table(runs), sep="\n\n")
     if args.json:
-        args.json.write_text(json.dumps({"trees": TREES, "surveys": runs}, indent=1) + "\n")
+        args.json.write_text(json.dumps({"surveys": runs}, indent=1) + "\n")
     if args.calibration:
         counts = json.dumps(calibrate(judged).to_dict(), separators=(",", ":"))
         args.calibration.write_text(counts + "\n")

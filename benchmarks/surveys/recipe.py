@@ -20,8 +20,9 @@ DENSITIES = (8.0, 2.0, 0.6)
 #: Points per square meter, at most, of copies that have one return of each pulse, the first or the
 #: last.
 ONE_RETURN = (12.0, 3.0)
-#: Height in meters below which a label of something standing is not believed.
-BELOW = 0.3
+#: Height in meters below which a label of something standing is not believed, and above which a
+#: label of ground is not: rocks that the filter cuts off taught that roofs may be ground.
+BELOW, ABOVE = 0.3, 1.5
 #: Points of a copy at most: a square of it, each copy's somewhere else, wide enough for whole
 #: houses.
 MOST = 45_000
@@ -96,13 +97,15 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
 
 
 def contradicted(cloud: Cloud | TrainingCloud) -> np.ndarray:
-    """Return which points (n,) are labeled as standing, but are Ground and below :data:`BELOW`.
+    """Return which points (n,) have a label that their height contradicts.
 
-    These are feet of walls and courtyards.
+    They are labeled as standing, but are Ground and below :data:`BELOW` (feet of walls, courtyards),
+    or labeled ground, but above :data:`ABOVE` (rocks).
     """
-    low = np.asarray(cloud.dimensions["HeightAboveGround"]) < BELOW
-    low &= np.asarray(cloud.dimensions["Ground"]) > 0
-    return low & np.isin(cloud.labels, (4, 5, 6))
+    height = np.asarray(cloud.dimensions["HeightAboveGround"])
+    low = (height < BELOW) & (np.asarray(cloud.dimensions["Ground"]) > 0)
+    stands = np.isin(cloud.labels, (4, 5, 6))
+    return (low & stands) | ((height > ABOVE) & (cloud.labels == GROUND))
 
 
 def square(cloud: Cloud, most: int, number: int) -> np.ndarray:
