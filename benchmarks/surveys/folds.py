@@ -26,7 +26,7 @@ from pdal_stages.classifier.interface import PredictRequest
 from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.random_forest import Forest, grow_forest
 from pdal_stages.classifier.sampling import draw_samples
-from pdal_stages.classifier.train_forest import FOLD_TREES, feature_plan
+from pdal_stages.classifier.train_forest import feature_plan, fold_trees
 from pdal_stages.classifier.training_clouds import label_classes
 
 #: Parts of the surveys that are left out in turn for the votes that a later pass reads.
@@ -104,7 +104,7 @@ class GroupsLeftOut:
         `values` are what the pass reads of the samples, `before` the votes of the pass before it,
         if there is one.
         """
-        votes, trees = {}, max(1, round(FOLD_TREES * OPTIONS.trees))
+        votes, trees = {}, fold_trees(OPTIONS.trees)
         sampled = np.unique(self.samples.cloud[self.group != group])
         for fold in np.unique(self.fold_of[sampled]).tolist():
             forest = self._grow(values, (self.group != group) & (self.fold != fold), trees)

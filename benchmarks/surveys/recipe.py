@@ -21,7 +21,8 @@ DENSITIES = (8.0, 2.0, 0.6)
 #: last.
 ONE_RETURN = (12.0, 3.0)
 #: Height in meters below which a label of something standing is not believed, and above which a
-#: label of ground is not: rocks that the filter cuts off taught that roofs may be ground.
+#: label of ground is not (not tuned): rocks that the filter cuts off taught that roofs may be
+#: ground.
 BELOW, ABOVE = 0.3, 1.5
 #: Points of a copy at most: a square of it, each copy's somewhere else, wide enough for whole
 #: houses.

@@ -62,6 +62,11 @@ def inputs(options: TrainingOptions) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*dimensions, *options.base.plan.dimensions]))
 
 
+def fold_trees(trees: int) -> int:
+    """Return the trees of a forest that judges a fold, of those of the final one."""
+    return max(1, math.ceil(trees * FOLD_TREES))
+
+
 def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
     """Train a forest, see :func:`pdal_stages.classifier.train`."""
     return ForestTraining(clouds, options, progress).model()
@@ -104,7 +109,7 @@ class ForestTraining:
             self.first = _join_columns(self.values, self._context_of_samples())
         self.xy = self.samples.take(lambda number: clouds[number].xyz[:, :2])
         self.growth = self._growth()
-        self.fold_trees = max(1, math.ceil(options.trees * FOLD_TREES))
+        self.fold_trees = fold_trees(options.trees)
 
     def _draw_samples(self) -> Samples:
         """Draw as many samples of each class."""

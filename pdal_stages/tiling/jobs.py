@@ -331,8 +331,6 @@ class SavedArrays(Mapping[str, NDArray]):
 
     def __getitem__(self, name: str) -> NDArray:
         """Return an array."""
-        if name not in self._names:
-            raise KeyError(name)
         return load_arrays(self._path, [name])[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -120,12 +120,9 @@ def make_block(
 def blocks_near(context: RunContext, box: Box, distance_m: float) -> list[tuple[int, int]]:
     """Return the blocks that touch a box, in the unit of the coordinates, grown by some meters."""
     assert context.plan.blocks is not None
-    return TileGrid(context.plan.blocks.side).covering(_box_m(context, box, distance_m))
-
-
-def _box_m(context: RunContext, box: Box, distance_m: float) -> Box:
     x0, y0, x1, y1 = (side * context.unit for side in box)
-    return (x0 - distance_m, y0 - distance_m, x1 + distance_m, y1 + distance_m)
+    grown = (x0 - distance_m, y0 - distance_m, x1 + distance_m, y1 + distance_m)
+    return TileGrid(context.plan.blocks.side).covering(grown)
 
 
 def load_blocks(context: RunContext, box: Box, read_m: float) -> list[SavedArrays]:
