@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,9 @@ from pdal_stages.classifier.training_options import (
     with_recipe,
 )
 from pdal_stages.features import FeaturePlan
-from pdal_stages.stages.registry import stage_from
+from pdal_stages.pipeline.json_source import parse_overrides
+from pdal_stages.stages.registry import stage_from, stage_types
+from pdal_stages.tiling.train_survey import TrainTask
 
 #: Features of a recipe, by the texts: [B16 3.1, 3.2.1], [W18 3.1, 3.2], [H17 2.2].
 FEATURES = {"blomley2016": 312, "weinmann2018": 560, "he2017": 6}
@@ -42,6 +46,28 @@ def test_the_networks_recipe():
     assert stage.alsnet["configuration"] == "alsnet4"
     merged = with_recipe({"recipe": "winiwarter2019", "alsnet": {"epochs": 2}})["alsnet"]
     assert merged == {**stage.alsnet, "epochs": 2}
+
+
+def test_options_of_the_network_beside_its_recipe_may_be_text(tmp_path):
+    """Stock PDAL and the command line give text: the recipe's other options stay."""
+    known = {"type": "writers.classifiermodel", "filename": "a.model", "recipe": "winiwarter2019"}
+    stage = stage_from({**known, "alsnet": '{"epochs": 2}'})
+    assert stage.alsnet == {**RECIPES["winiwarter2019"]["alsnet"], "epochs": 2}
+    overrides, _ = parse_overrides(['--writers.classifiermodel.alsnet={"epochs": 2}'])
+    writer = {"recipe": "winiwarter2019"}
+    task = TrainTask([], str(tmp_path / "a.model"), overrides, writer)
+    assert task.stage.alsnet == stage.alsnet
+    with pytest.raises(OptionError, match=r"writers.classifiermodel: option 'alsnet' must be a"):
+        stage_from({**known, "alsnet": '{"epochs": 2, "epochs": 3}'})
+
+
+def test_an_object_as_text_is_that_object():
+    labels = {"5": [3, 4]}
+    for name, stage in stage_types().items():
+        for option in stage.all_options():
+            if "object" in option.schema()["type"]:
+                assert option.decode(json.dumps(labels)) == labels, f"{name}: {option.name}"
+                assert option.decode(labels) == labels
 
 
 @pytest.mark.parametrize("name", [*RECIPES])

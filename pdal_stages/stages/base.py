@@ -18,6 +18,7 @@ from .options import (
     Option,
     Selection,
     declared_option,
+    decode_options,
     ignore_option,
     option,
     parse_options,
@@ -156,8 +157,9 @@ class Stage(ABC):
 
     def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
         self.place = place or self.type
-        self.set_options = frozenset(raw_options)
         try:
+            raw_options = self.complete(decode_options(self.all_options(), raw_options))
+            self.set_options = frozenset(raw_options)
             self.options = parse_options(self.all_options(), raw_options)
             for name in ("horizontal_unit", "vertical_unit"):
                 if self.options[name]:
@@ -190,6 +192,11 @@ class Stage(ABC):
         where = options["where"]
         options["where"] = replace(where, help=f"{where.help}. {cls.where_help}")
         return tuple(reversed(options.values()))
+
+    @classmethod
+    def complete(cls, raw_options: dict[str, Any]) -> dict[str, Any]:
+        """Return the options of a user with those that a word among them stands for."""
+        return raw_options
 
     @classmethod
     def needs_all_points(cls) -> bool:

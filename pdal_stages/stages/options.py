@@ -164,6 +164,19 @@ class Option:
             out["default"] = self.default
         return out
 
+    def decode(self, value: Any) -> Any:
+        """Return the object or list of a JSON text, where the option takes an object.
+
+        Stock PDAL and the command line give options as text. Other values return as they are.
+        """
+        is_json = isinstance(value, str) and value.lstrip().startswith(("{", "["))
+        if not is_json or "object" not in _KINDS[self.kind][0]:
+            return value
+        try:
+            return checks.strict_json(value)
+        except (ValueError, RecursionError):
+            raise self._wrong(value) from None
+
     def parse(self, value: Any) -> Any:
         """Parse a value from JSON or the command line; OptionError where it does not fit."""
         parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
@@ -202,12 +215,7 @@ class Option:
         return value
 
     def _parse_classes(self, value: Any) -> Any:
-        """Leave the reading to :class:`..classifier.class_map.ClassMap`, but for JSON in a text."""
-        if isinstance(value, str) and value.lstrip().startswith(("{", "[")):
-            try:
-                value = checks.strict_json(value)
-            except (ValueError, RecursionError):
-                raise self._wrong(value) from None
+        """Leave the reading to :class:`..classifier.class_map.ClassMap`."""
         if not isinstance(value, str | list | dict):
             raise self._wrong(value)
         return value
@@ -245,12 +253,9 @@ class Option:
         return Selection.parse(self._parse_list(split_selection(value)), self.name)
 
     def _parse_mapping(self, value: Any) -> dict:
-        parsed = value
-        with suppress(ValueError):
-            parsed = json.loads(value) if isinstance(value, str) else value
-        if not isinstance(parsed, dict):
+        if not isinstance(value, dict):
             raise self._wrong(value)
-        return parsed
+        return value
 
 
 def option(
@@ -308,6 +313,12 @@ def split_selection(value: Any) -> Any:
     ``9,Z[1:2)`` are two, though a bracket follows the comma.
     """
     return value.split(",") if isinstance(value, str) else value
+
+
+def decode_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[str, Any]:
+    """Return raw options with the objects that are given as text decoded."""
+    known = {option.name: option for option in declared}
+    return {name: known[name].decode(raw[name]) if name in known else raw[name] for name in raw}
 
 
 def parse_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[str, Any]:

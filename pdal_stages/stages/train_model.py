@@ -89,8 +89,10 @@ class TrainModel(Stage, settings=TrainingOptions):
         "list", (), "Input files that the model file names; default: those of the readers"
     )
 
-    def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
-        super().__init__(with_recipe(raw_options), place)
+    @classmethod
+    def complete(cls, raw_options: dict[str, Any]) -> dict[str, Any]:
+        """Return the options with those of the recipe that they name."""
+        return with_recipe(raw_options)
 
     @classmethod
     def from_pipeline(
