@@ -115,7 +115,7 @@ class ReliabilityHistogram:
     def expected_calibration_error(self) -> float | None:
         """Return the mean distance of reliability and share right, over bins weighted by points.
 
-        None without points. Source: Naeini, Cooper, Hauskrecht 2015, AAAI (ECE).
+        The result is None without points. Source: Naeini, Cooper, Hauskrecht 2015, AAAI (ECE).
         """
         bins = self.curve()
         error = sum(b["points"] * abs(b["mean"] - b["share_right"]) for b in bins)

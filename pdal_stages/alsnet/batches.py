@@ -107,9 +107,9 @@ class Batches:
         return len(self.centers)
 
     def nearest_points(self, x: float, y: float, size: int | None = None) -> npt.NDArray[np.int64]:
-        """Return the rows of the points nearest to a place in plan, within ``reach``.
+        """Return rows of the points nearest to a place within ``reach``, in canonical order.
 
-        In the canonical order. Of points equally far the first in that order are taken.
+        Of points equally far the first in that order are taken.
         """
         size = self.points if size is None else size
         radius = self.reach * (1.0 + 1e-9)  # a few beyond too
@@ -195,9 +195,7 @@ def augment(
 def farthest_point_sampling(
     xyz: npt.NDArray[np.float64], count: int, start: int = 0
 ) -> npt.NDArray[np.int64]:
-    """Return `count` points, each the one farthest from those chosen before it.
-
-    Exact; the first one is `start`.
+    """Return `count` points from `start` on, each exactly the one farthest from those before it.
 
     Indices come in the order they were chosen, each once (points that coincide included). Points
     are kept in buckets, in the order of a tree; one whose box is farther from the new point than

@@ -135,10 +135,7 @@ class AlsNet:
         yield Block(rows, mean, np.maximum(variance, 0.0))
 
     def _apply_on(self, device: str) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
-        """Return the function that applies the network to a batch.
-
-        It runs in NumPy, or in PyTorch where a GPU is asked for.
-        """
+        """Return the function that applies the network to a batch, with NumPy or PyTorch."""
         if device == "cpu":
             return self.network
         from .torch_network import apply_on_device, resolve_device

@@ -47,10 +47,7 @@ class Configuration:
     dropout: float = 0.5
 
     def _linear(self, inputs: int) -> Iterator[tuple[str, int, int, int, int]]:
-        """Yield name, rows, inputs, outputs and depth below of every layer but the last.
-
-        They come in the order of the computation.
-        """
+        """Yield name, rows, inputs, outputs and depth below of all but the last layer, in order."""
         width, rows = [inputs], [self.points]
         for number, level in enumerate(self.levels, 1):
             rows.append(min(level.centers, rows[-1]))
@@ -81,10 +78,7 @@ class Configuration:
         return {**out, "scores": (classes, self.head[-1] + 1)}
 
     def memory_mb(self, inputs: int) -> float:
-        """Return the megabytes that one batch takes at most where the network is applied.
-
-        Counted from the sizes of its arrays.
-        """
+        """Return the megabytes of the arrays that one batch takes at most in prediction."""
         most = max(
             rows * (before + 2 * after + 3 * below)
             for _, rows, before, after, below in self._linear(inputs)

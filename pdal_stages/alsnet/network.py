@@ -43,7 +43,7 @@ def check_weights(
 ) -> None:
     """Raise a ModelError for arrays that do not fit a configuration.
 
-    They are missing, unknown, of other shapes, not finite, or of negative variance.
+    That is where one is missing, unknown, of another shape, not finite, or a negative variance.
     """
     shapes = configuration.shapes(inputs, classes)
     if odd := sorted(set(weights) ^ set(shapes)):

@@ -83,9 +83,7 @@ class Network(nn.Module):
 def apply_on_device(
     device: str, weights: Weights, configuration: Configuration, inputs: int, classes: int
 ) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
-    """Return a function that gives the class probabilities (n, classes) of a batch.
-
-    It runs on a device of PyTorch.
+    """Return a function that gives class probabilities (n, classes) of a batch on a device.
 
     They equal those of ``network.NumpyNetwork`` up to rounding.
     """
@@ -100,10 +98,7 @@ def apply_on_device(
 
 
 def resolve_device(device: str) -> str:
-    """Return ``cuda`` or ``cpu`` for a device option.
-
-    DependencyError for cuda where there is none.
-    """
+    """Return ``cuda`` or ``cpu`` for a device option; DependencyError for a missing cuda."""
     cuda = torch.cuda.is_available()
     if device == "cuda" and not cuda:
         raise DependencyError(

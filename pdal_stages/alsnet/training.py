@@ -273,10 +273,7 @@ def _load_start(options: NetworkOptions, names: tuple[str, ...]) -> Model:
 
 
 def _transfer(source: Model, start: Weights, classes: ClassMap) -> Weights:
-    """Return the initial weights of transfer learning [WM19 3].
-
-    They are those of the source; in the last layer only for classes that both have.
-    """
+    """Return the source's weights, of the last layer only for classes that both have [WM19 3]."""
     weights, codes = source.algorithm.weights, source.codes.tolist()
     scores = start["scores"].copy()
     for k, code in enumerate(classes.codes):

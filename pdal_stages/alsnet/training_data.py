@@ -133,7 +133,7 @@ def join_clouds(
 def histogram_deviation(histogram: npt.NDArray[Any]) -> float:
     """Return the standard deviation of a batch's class shares, in per cent [WM19 4.1].
 
-    It is large where one class is nearly all.
+    The deviation is large where nearly all points are of one class.
 
     Infinite for a batch without labels.
     """
@@ -165,7 +165,7 @@ def hold_out(
 ) -> npt.NDArray[np.bool_]:
     """Return which labeled points (not -1) lie in the blocks held out for validation.
 
-    These are one fold of a whole number: of `share` 0.4 it is one of two, a half.
+    The blocks are one of round(1 / `share`) folds: of `share` 0.4 one of two, a half.
     """
     out, use = np.zeros(len(xyz), bool), np.flatnonzero(labels >= 0)
     if share == 0.0:

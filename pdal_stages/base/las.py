@@ -86,9 +86,9 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
 
 
 def header_there(path: str | os.PathLike) -> LasHeader | None:
-    """Return the header of a LAS or LAZ file; None also where the file cannot be read.
+    """Return the header of a LAS or LAZ file; None for other files and unreadable ones.
 
-    That is reported when its points are read.
+    A file that cannot be read is reported when its points are read.
     """
     try:
         return read_header(path)

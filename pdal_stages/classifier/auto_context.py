@@ -153,10 +153,7 @@ class PassRun:
         self._features = _share_sources(read, request)
 
     def blocks(self) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any]]]:
-        """Yield the rows wanted with probabilities, or columns of the context.
-
-        Rows are those of the request's cloud.
-        """
+        """Yield rows of the request's cloud with their probabilities, or columns of the context."""
         if not self._request.count:
             return
         bands = self._strips.bands()
@@ -242,10 +239,7 @@ class _StepOnBand:
     keep: bool = False  #: whether a later step needs the features
 
     def compute(self, part: tuple[int, int]) -> tuple[FeatureBlock, npt.NDArray[Any]]:
-        """Return a block of features, and the result of the step.
-
-        Its values are dropped where no later step needs them.
-        """
+        """Return a block of features, with values if a later step needs them, and the result."""
         assert self.run is not None
         block = self.run.compute(part)
         result = self.result(block.rows, block.values)
@@ -264,10 +258,7 @@ class _StepOnBand:
     def result(
         self, rows: npt.NDArray[np.int64], values: npt.NDArray[np.float32] | None
     ) -> npt.NDArray[Any]:
-        """Return shares (b, classes), probabilities, or columns of the context.
-
-        They follow from features (b, f) and context.
-        """
+        """Return shares (b, classes), probabilities or context columns of a block."""
         parts = [] if values is None else [values]
         if self.context is not None:
             parts.append(self.context.columns(self.strips.places(rows) - self.first_place))
@@ -301,9 +292,7 @@ Band = tuple[slice, slice]
 
 
 class Strips:
-    """Points in the order of strips of ground, each `width` meters, from south to north.
-
-    Only `rows` are looked at; None for all.
+    """Points `rows` (None: all) in the order of strips of `width` meters, from south to north.
 
     Strips begin at multiples of the width.
     """

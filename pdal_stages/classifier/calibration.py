@@ -155,9 +155,7 @@ class Calibration:
 
 
 def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
-    """Return the calibration of a model.
-
-    It is in the manifest `info`, or in the file beside the model's `path`.
+    """Return a model's calibration from its manifest `info`, or from the file beside its `path`.
 
     Raises
     ------

@@ -43,10 +43,7 @@ HEIGHT = "HeightAboveGround"
 
 @dataclass(frozen=True)
 class Context:
-    """Features of the surroundings that a pass reads.
-
-    OptionError for an unknown token.
-    """
+    """Features of the surroundings that a pass reads; OptionError for an unknown token."""
 
     #: ``own``, a word of :data:`CELLS` and a side (``box1``, ``columnvotes8``), or ``segments6``
     tokens: tuple[str, ...]
@@ -88,10 +85,7 @@ class Context:
 
     @property
     def strip(self) -> float:
-        """Width in meters of strips: a point reads its own and the two beside it.
-
-        0 where it reads nothing around.
-        """
+        """Width in meters of strips: a point reads three of them; 0 without context."""
         sides = [side for side, _, _ in self.scales.values()]
         return max(sides + [RULES.block] * bool(self.segment_codes), default=0.0)
 
@@ -101,10 +95,7 @@ class Context:
         return 2.0 * self.strip
 
     def names(self, codes: Sequence[int]) -> tuple[str, ...]:
-        """Return the names of the columns, where the pass before has these classes.
-
-        They are as ``Probability_2_box0_5``.
-        """
+        """Return names of columns like ``Probability_2_box0_5``, by classes of the pass before."""
         names: list[str] = []
         for token in self.tokens:
             of_codes = [f"Probability_{code}" for code in codes]
@@ -205,7 +196,7 @@ def rows_needed(
 ) -> npt.NDArray[np.int64] | None:
     """Return the rows, ascending, that the context of some rows depends on; None for all.
 
-    These are whole cells: what of a cell is asked for is all of it.
+    A row brings all rows of its cell.
     """
     if rows is None or not len(rows) or not context.strip:
         return rows

@@ -66,10 +66,7 @@ class Features:
 
 
 class CloudFeatures:
-    """Features of the points of a request, computed in blocks.
-
-    Counts go into the request's report.
-    """
+    """Features of the points of a request, computed in blocks and counted in its report."""
 
     def __init__(self, features: Features, request: PredictRequest) -> None:
         self.features, self._request = features, request
@@ -82,10 +79,7 @@ class CloudFeatures:
         take_dimensions(names, self._dimensions, len(request.xyz), request.rows)
 
     def run(self, rows: npt.NDArray[np.int64] | None, memory_share: float = 1.0) -> Run:
-        """Return the blocks of some rows (None: all) to compute.
-
-        They take `memory_share` of the request's memory.
-        """
+        """Return blocks of some rows (None: all) that take `memory_share` of the memory."""
         request, features = self._request, self.features
         if self._engine is None:
             grid = request.grid

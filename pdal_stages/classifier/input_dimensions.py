@@ -35,10 +35,7 @@ _CURES = {
 
 
 def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the dimensions among feature names that a cloud must have.
-
-    These are neither coordinates nor return features.
-    """
+    """Return the dimensions among feature names: neither coordinates nor return features."""
     known = (*COORDINATES, *return_features.NAMES)
     return tuple(dict.fromkeys(name for name in names if name not in known))
 
@@ -58,8 +55,7 @@ def list_values(
 ) -> list[npt.NDArray[Any]]:
     """Return the values (n,) of the dimensions that features use.
 
-    All required ones, and the optional ones that are there; checked at `rows`, as by
-    :func:`take_dimensions`.
+    Optional ones may be missing. Values are checked at `rows`, as by :func:`take_dimensions`.
     """
     names = tuple(names)
     optional = (name for name in optional_dimensions(names) if name in dimensions)
@@ -90,9 +86,7 @@ def take_dimensions(
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the values of dimensions at some rows of a cloud of n points, by name.
-
-    Coordinates are passed over.
+    """Return by name, but for coordinates, the dimensions at some rows of a cloud of n points.
 
     Parameters
     ----------

@@ -75,10 +75,7 @@ class Block(NamedTuple):
 def weigh(
     p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None
 ) -> npt.NDArray[np.float64]:
-    """Multiply the probabilities (b, classes) of each class by its factor.
-
-    None leaves them as they are.
-    """
+    """Multiply the probabilities (b, classes) of each class by its factor; None changes nothing."""
     if factors is None:
         return p
     p = p * factors

@@ -143,7 +143,7 @@ class Model:
     def importances(self, number: int = -1) -> dict[str, float]:
         """Return the mean decrease in impurity by input, summing to 1, largest first.
 
-        `number` tells which of the `passes`. ModelError for a network, which has none.
+        `number` tells which of the `passes`. A network has no importances: ModelError.
         """
         entry = self.manifest()["passes"][number]
         if entry["importances"] is None:

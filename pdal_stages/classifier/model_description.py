@@ -118,10 +118,7 @@ def range_text(densities: Mapping[str, float]) -> str:
 
 
 def held_out(info: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the scores on ground that was held out; empty where there are none.
-
-    A network has its own; a forest has those of the cross-validation.
-    """
+    """Return the scores on held-out ground, of a forest by cross-validation; empty without any."""
     of_network = info["training"].get("held_out")
     crossed = info["accuracy"]["cross_validation"]
     return of_network if isinstance(of_network, dict) else crossed["chosen"] if crossed else {}

@@ -71,10 +71,7 @@ class PredictionOptions(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Classes of a cloud's points, in its order.
-
-    Numbers are 0 for points that were not classified.
-    """
+    """Classes of a cloud's points, in its order, with 0 for points that were not classified."""
 
     classification: npt.NDArray[np.uint8]  #: (n,) ASPRS codes
     reliability: npt.NDArray[np.float32]  #: (n,) probability of the winning class
@@ -106,10 +103,7 @@ class PointRoles:
         current: npt.ArrayLike | None,
         may_be_ground: npt.ArrayLike | None,
     ) -> PointRoles:
-        """Return the roles of n points from arguments of ``Model.predict``.
-
-        OptionError for other shapes or types.
-        """
+        """Return the roles of n points from arguments of ``Model.predict``, checked."""
         wanted = np.ones(n, np.bool_) if where is None else _column("where", where, n, np.bool_)
         present = codes = not_ground = None
         if ignore is not None and (ignored := _column("ignore", ignore, n, np.bool_)).any():
@@ -155,10 +149,7 @@ def _column(name: str, values: npt.ArrayLike, n: int, dtype: type) -> npt.NDArra
 
 @dataclass(frozen=True, eq=False)
 class WorkingCloud:
-    """Points of a cloud that are computed: one for each voxel, none that is ignored.
-
-    They are in the order of the features' grid.
-    """
+    """Points that are computed, in the order of the grid: one for each voxel, none ignored."""
 
     xyz: npt.NDArray[np.float64]  #: (k, 3) meters
     #: rows in work that stand for points to classify, ascending; None: all
@@ -216,10 +207,7 @@ class WorkingCloud:
     def members(
         self, rows_in_work: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64] | slice]:
-        """Return the rows in the cloud that a block stands for.
-
-        And for each of them the row in the block that stands for it.
-        """
+        """Return the cloud's rows that a block stands for, and the block's row for each."""
         rows = self._order[rows_in_work]
         if self._representatives is None:
             return rows, slice(None)

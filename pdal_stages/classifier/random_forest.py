@@ -185,7 +185,7 @@ def _laid_out(
 ) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.int32]]:
     """Return the left child of each node within its tree, and the depth of each tree.
 
-    Of a leaf it is itself. ModelError where the nodes are not trees.
+    A leaf is its own child. ModelError where the nodes are not trees.
 
     Trees are stored level by level, so the children of a tree's k-th split node are its nodes 2k+1
     and 2k+2: no child pointers are stored, and no file can hold a cycle or a shared child.

@@ -189,10 +189,7 @@ def share_out(available: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.in
 def spread(
     n: int, count: int, random: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return places of `count` of `n` in a row, equally far apart, and their weights.
-
-    The first is at random.
-    """
+    """Return places and weights of `count` of `n` in a row, equally far apart, first at random."""
     share, rest = divmod(count, n)
     picks = np.floor((np.arange(rest) + random.random()) * (n / max(rest, 1))).astype(np.int64)
     picks = np.minimum(picks, n - 1)

@@ -241,10 +241,7 @@ class ForestTraining:
                 yield rows, self._grow(values, weight * train, self.fold_trees, bar)[0]
 
     def _validate(self) -> tuple[dict[str, Any] | None, dict[str, str]]:
-        """Return the cross-validation for the manifest, and why there is none.
-
-        It holds out surveys where there are several, else blocks of ground.
-        """
+        """Hold out surveys, or blocks of one survey: return the scores, or why there are none."""
         o, samples, codes = self.options, self.samples, self.codes
         if o.folds == 0:
             return None, {}
@@ -326,7 +323,7 @@ class ForestTraining:
     ) -> npt.NDArray[np.float32]:
         """Return the context (samples, columns) that a pass reads of those before.
 
-        These are the passes of the base, or forests that have not seen the samples.
+        The passes before are those of the base, or forests that have not seen the samples.
         """
         o, base, context = self.options, self.base, self.context
         codes = self.codes if base is None else base.codes
@@ -356,7 +353,7 @@ class ForestTraining:
     def _held_by_base(self) -> dict[str, Any]:
         """Return by new class the samples, and those that the base calls a class without labels.
 
-        Such points stay what the base calls them.
+        Points of classes without labels keep the class of the base.
         """
         if self.base is None:
             return {}

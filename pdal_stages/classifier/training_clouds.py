@@ -133,10 +133,7 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
 
 
 def _left_out(options: TrainingOptions) -> list[int]:
-    """Return the labels that do not become classes by themselves, but for classes of the base.
-
-    They are 0, 1, noise (7, 18) and overlap (12).
-    """
+    """Return those of the labels 0, 1, 7, 12, 18 for which the base has no class."""
     known = () if options.base is None else options.base.codes
     return [label for label in UNINFORMATIVE if label not in known]
 

@@ -107,9 +107,7 @@ def _options(options: argparse.Namespace) -> None:
 
 
 def _commands(main_parser: Parser, options: argparse.Namespace) -> None:
-    """Print commands, stages, models and classes as JSON, for programs that build dialogs.
-
-    The plugin for QGIS is one of them.
+    """Print commands, stages, models and classes as JSON, from which QGIS builds dialogs.
 
     An argument has ``name``, ``flag`` (empty for one without), ``kind`` (``number``, ``integer``,
     ``boolean``, ``string``), ``help``, ``default``, ``choices``, ``required``, ``many`` (add

@@ -113,7 +113,7 @@ def run_until_interrupted(start: Callable[[], TiledRun]) -> tuple[TiledRun, bool
 def end_at_ctrl_c(is_program: bool) -> None:
     """Let Ctrl-C end the program while PDAL works, when Python cannot handle signals.
 
-    The next run cleans up.
+    The next run removes what this one leaves.
     """
     if is_program and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -137,10 +137,7 @@ def print_classes(
 
 
 def print_output(job: Job, names: Mapping[int, str]) -> None:
-    """Print an output when it is finished.
-
-    For instance ``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %``.
-    """
+    """Print a finished output, as ``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %``."""
     assert job.outputs is not None
     classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
     total = sum(classes.values())

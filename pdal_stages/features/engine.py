@@ -154,9 +154,9 @@ class FeatureEngine:
         return out
 
     def shape_values(self, rows: np.ndarray, threshold: float | None) -> dict[str, np.ndarray]:
-        """Return by token the metrics of all pulls round points of the cloud, comparable.
+        """Return metrics (m, METRICS, PULLS) float32 of all pulls round m `rows`, by token.
 
-        (m, METRICS, PULLS) float32 for m `rows`; `threshold` is the one of copt.
+        `threshold` is the curvature from which on `copt` takes a point for scattered.
         """
         x, y, z = np.ascontiguousarray(self.cloud[rows].T)
         values: dict[str, np.ndarray] = {}
@@ -238,7 +238,7 @@ class FeatureBlock(NamedTuple):
 class Run:
     """A run over queries, sorted like the cloud and cut into blocks.
 
-    Arguments as of :meth:`FeatureEngine.run`.
+    Arguments are those of :meth:`FeatureEngine.run`.
     """
 
     def __init__(

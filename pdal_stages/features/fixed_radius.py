@@ -186,10 +186,7 @@ def copy_points(grid, first, last, candidates, at):
 
 @device
 def members(candidates, count, point, spherical, r2, record):
-    """List the members of one neighborhood in canonical order, as float32 offsets from the query.
-
-    Return how many there are.
-    """
+    """List a neighborhood's members in canonical order, as float32 offsets; return how many."""
     px, py, pz, _ = candidates
     qx, qy, qz = point
     n = 0

@@ -321,7 +321,7 @@ def make_groups(qx, qy, qz):
 def gather_near(tree, queries, lo, hi, wanted, reach2, near):
     """Find candidates for the queries order[lo:hi], or for the first alone.
 
-    That happens where candidates are too many or the queries lie too far apart.
+    The first is alone where candidates are too many or the queries lie too far apart.
 
     Returns
     -------
@@ -362,9 +362,9 @@ def gather_near(tree, queries, lo, hi, wanted, reach2, near):
 
 @device(forceinline=True)
 def sort_near(near, count, point, wanted, reach2):
-    """Sort the neighbors of a point (x, y, z) into near.sorted and near.pos.
+    """Sort neighbors of (x, y, z) into near.sorted and near.pos; return how many, or -1.
 
-    Return how many there are, or -1 where `reach2` is too short.
+    The result is -1 where `reach2` is too short.
     """
     x, y, z, d2, bins, hist = near.x, near.y, near.z, near.d2, near.bins, near.hist
     need, within2, cap2 = wanted.need, wanted.within2, wanted.cap2

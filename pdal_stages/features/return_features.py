@@ -47,7 +47,7 @@ def return_features(
 ) -> dict[str, npt.NDArray[Any]]:
     """Compute those of `names` that are return features, for every point of a cloud.
 
-    (n,) each, from 0 to 1; uint8 for the point itself, float32 for its surroundings.
+    The columns (n,) are from 0 to 1: uint8 of the point itself, float32 of its surroundings.
 
     Of `dimensions`, ``ReturnNumber`` and ``NumberOfReturns`` are read, (n,) each; without them all
     is 0.

@@ -32,7 +32,7 @@ LEAST_PART = 1e-16
 def add_up(near, point, ends, first, last, s):
     """Write moments s[:MOMENTS, j] of the first ends[j] neighbors, for j from `first` to `last`.
 
-    They are about the point, and the ends of these ascend.
+    Moments are about the point; the ends ascend.
     """
     qx, qy, qz = point
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -72,7 +72,7 @@ def write_moments(s, j, table, column):
 def estimate_entropy(xx, xy, xz, yy, yz, zz, noise):
     """Return the eigenentropy of a covariance matrix to 1e-7, in closed form without a branch.
 
-    ``NEVER`` where the trace is not above `noise`.
+    The result is ``NEVER`` where the trace is not above `noise`.
 
     With unit trace, the eigenvalues are 1/3 + 2 p cos(phi + 2 pi i / 3), cos(3 phi) = r. For r >=
     0 the squared sine of phi is (1 - r) times a smooth function g of r, here a polynomial of degree
@@ -146,9 +146,7 @@ def estimate_entropies(s, entropy, first, last, least):
 
 @device
 def lowest_entropy(s, first, last, least_members):
-    """Return the candidate of first..last - 1 with the lowest eigenentropy; or last - 1.
-
-    The last one is taken where none qualifies.
+    """Return the candidate of first..last - 1 with the lowest eigenentropy, else last - 1.
 
     Parameters
     ----------

@@ -293,7 +293,7 @@ class NeighborhoodGroup:
         raise NotImplementedError
 
     def shape_values(self, points: Axes, fitted: Fitted) -> dict[str, np.ndarray]:
-        """Return by token the metrics (m, METRICS, PULLS) of all pulls round points, comparable.
+        """Return by token comparable metrics (m, METRICS, PULLS) of all pulls round points.
 
         `fitted` has no bins.
         """
@@ -321,9 +321,9 @@ def point_seeds(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int, token: s
 
 
 def smallest_hashes(xyz: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the SAMPLES points with the smallest hashes of seed and coordinates.
+    """Return the SAMPLES smallest hashes (m,) of seed and coordinates, and their points (m,).
 
-    Copies of a point count once. Hashes (m,), ascending, and rows (m,) of the points.
+    Hashes ascend; copies of a point count once.
     """
     hashes, rows = np.zeros(0, np.uint64), np.zeros(0, np.int64)
     for start in range(0, len(xyz), _BATCH):

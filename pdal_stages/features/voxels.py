@@ -107,7 +107,7 @@ def _one_each(
 ) -> npt.NDArray[Any] | None:
     """Return the point (n,) that stands for each; None where no voxel holds two.
 
-    Points that are not there stand for themselves.
+    Points that are not `wanted` stand for themselves.
     """
     keys, _ = compact_keys(xyz, side)
     if present is None:
@@ -121,9 +121,9 @@ def _one_each(
 
 @njit
 def choose_one_each(order, keys, hashes, by):
-    """Fill `by`: of points of equal keys, side by side in `order`, the one of the least hash.
+    """Fill `by`: of points of equal keys, side by side in `order`, the first with the least hash.
 
-    Among equals the first. Return whether no two points have the same key.
+    Return whether no two points have the same key.
     """
     single = True
     n = len(order)

@@ -205,7 +205,7 @@ class Cells:
     def sparse_kind(self) -> tuple[str, float] | None:
         """Return a kind with too few points for this cell size, and its mean per cell; or None.
 
-        Buildings decide, or trees where there are hardly any buildings.
+        The kind is buildings, or trees where there are hardly any buildings.
         """
         for kind, name in ((Kind.BUILDING, "buildings"), (Kind.TREE, "trees")):
             count = self.of_kind(kind).columns["count"]

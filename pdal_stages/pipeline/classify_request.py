@@ -111,7 +111,7 @@ class ClassifyRequest:
     def _prepared(self) -> tuple[list[dict[str, Any]], bool]:
         """Return the stages before the classifier, and whether they take ground that is given.
 
-        The model holds them, or they follow from its dimensions.
+        The model names these stages, or they follow from its dimensions.
         """
         needed = self.loaded.required_dimensions
         stages = self.loaded.info.get("preparation") or preprocessing.preparation_of(needed)

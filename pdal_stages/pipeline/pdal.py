@@ -463,10 +463,9 @@ def overwritten_dimensions(metadata: Any) -> list[str]:
 
 
 def flags_inside_classification(dimensions: Any, metadata: Any) -> bool:
-    """Return whether the flag bits of LAS 1.0-1.3 sit inside `Classification`.
+    """Return whether flag bits of LAS 1.0-1.3 sit inside `Classification`, as before PDAL 2.6.
 
-    That is so before PDAL 2.6. Newer versions have a dimension for each flag; LAS 1.4 formats
-    have `ClassFlags`.
+    Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
     """
     flags = ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")
     return max(_point_formats(metadata), default=6) <= 5 and not any(f in dimensions for f in flags)

@@ -91,10 +91,7 @@ def fault_of_reference(name: str) -> str:
 
 
 def plane_unit(stages: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any]) -> float | None:
-    """Return the unit of x and y, in meters, that readers give to writers; None if not known.
-
-    `metadata` is PDAL's, of the run.
-    """
+    """Return meters per unit of x and y from a run's `metadata` of PDAL; None if not known."""
     if any(stage["type"] in MOVING or "a_srs" in stage for stage in stages):
         return None
     with suppress(StageError):

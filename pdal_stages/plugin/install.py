@@ -49,7 +49,7 @@ def _driver_path() -> list[Path]:
 
 
 def install(folder: Path | None = None) -> list[Path]:
-    """Compile the plugin and install it, by default beside ``filters.python``; return the files.
+    """Compile the plugin into a folder, by default that of ``filters.python``; return the files.
 
     A missing `folder` is created.
     """

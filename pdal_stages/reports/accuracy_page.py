@@ -98,10 +98,7 @@ def write_accuracy_report(
 
 
 def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
-    """Return maps of reference, prediction and errors for the template.
-
-    There are none where the points lie at one place or in a line.
-    """
+    """Return maps of reference, prediction and errors; none of points at one place or in a line."""
     points = np.asarray(place.xyz, dtype=np.float64)
     true, labels = place.reference, place.predicted
     target_of = np.arange(1 << 16)

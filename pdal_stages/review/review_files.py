@@ -217,10 +217,7 @@ def _points_and_area(files: Sequence[str], references: dict[str, Any]) -> tuple[
 
 
 def compute_reliability(points: Mapping[str, NDArray], model_name: str) -> NDArray[np.float32]:
-    """Return the probability (n,) that a model gives to the class of each point.
-
-    It is 1 for classes that the model does not know.
-    """
+    """Return a model's probability (n,) of each point's class, 1 for unknown classes."""
     model = loaded_model(model_name)
     dimensions = {name: points[name] for name in model.optional_dimensions if name in points}
     result: Any = model.predict(points["xyz"], dimensions, probabilities=True)

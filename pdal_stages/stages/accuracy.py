@@ -249,7 +249,7 @@ class AccuracyStage(Stage):
 def _one_code_system(trained: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether labels and codes of a model mean the same.
 
-    They do not where label 5 became code 6, and label 8 code 5.
+    For instance they differ where label 5 became code 6, and label 8 code 5.
     """
     class_of = {label: c["code"] for c in trained for label in c["labels"]}
     return all(class_of.get(c["code"], c["code"]) == c["code"] for c in trained)

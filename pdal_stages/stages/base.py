@@ -385,10 +385,9 @@ class FarReaching(Stage):
 
     @abstractmethod
     def reduce_points(self, points: Points) -> dict[str, NDArray[np.float64]]:
-        """Return what blocks need of points.
+        """Return the points (n, 3) that blocks need: ``around``, and by block inside it.
 
-        That is an array (n, 3) ``around``, for blocks that the points do not lie in, and (n, 3)
-        for each block that they lie in (:func:`inside_block`).
+        Blocks that hold points are named by :func:`inside_block`.
         """
 
     @abstractmethod

@@ -308,10 +308,7 @@ def split_list(text: str) -> list[str]:
 
 
 def split_selection(value: Any) -> Any:
-    """Split the text of a selection at all commas, as ranges hold none; return others as they are.
-
-    ``9,Z[1:2)`` are two, though a bracket follows the comma.
-    """
+    """Split the text of a selection at commas: ``9,Z[1:2)`` are two; return others unchanged."""
     return value.split(",") if isinstance(value, str) else value
 
 

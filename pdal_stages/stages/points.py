@@ -253,10 +253,7 @@ class Points:
         return self.inside if created_before else self.inside | (self.arrays[name] == 0)
 
     def with_codes(self, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return values of `Classification` (n,) for class codes: with each point's flag bits.
-
-        The report counts the codes.
-        """
+        """Return class codes (n,) with each point's flag bits, and count codes in the report."""
         self.report.codes = class_counts(codes)
         limit = self.code_limit
         flags: Any = np.uint8(0)

@@ -309,10 +309,7 @@ def _look_ahead(layers, solid, in_survey, place, level, rules):
 
 @njit
 def _pair_steps(layers, solid, chosen, rules):
-    """Return pairs (k,), (k,) of chosen layers and of solid ones that one can step on to.
-
-    The second lies up to `link` cells away from the first.
-    """
+    """Return pairs (k,), (k,): chosen layers, solid ones a step away within `link` cells."""
     z, start, h, w = layers
     first, second, count = np.empty(1024, np.int64), np.empty(1024, np.int64), 0
     for j in range(h):

@@ -190,10 +190,7 @@ def _find_lone(layers, rules):
 
 @njit
 def _find_lines(layers, lone, line, rules):
-    """Return which layers (n,) have a line; fill `line` (n, 3) with that of each.
-
-    Its direction (x, y) and its rise over run.
-    """
+    """Return which layers (n,) have a line; fill `line` (n, 3): direction x, y, rise over run."""
     place, cells, start, h, w = layers
     good = np.zeros(len(lone), np.bool_)
     length = rules.half_m

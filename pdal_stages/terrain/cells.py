@@ -19,10 +19,7 @@ LAYER_GAP_M = 1.0
 
 
 def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDArray[np.float64]]:
-    """Return three arrays of one length, from three or from one of shape (n, 3).
-
-    StageError where shapes differ.
-    """
+    """Return three arrays of one length, from three or one (n, 3); StageError for others."""
     three: Any = np.asarray(x).T if y is None and z is None else (x, y, z)
     axes = [np.asarray(axis, np.float64, order="C") for axis in three]
     if len(axes) != 3 or axes[0].ndim != 1 or len({axis.shape for axis in axes}) > 1:
@@ -34,10 +31,7 @@ def columns(x: ArrayLike, y: ArrayLike | None, z: ArrayLike | None) -> list[NDAr
 
 
 def usable(*axes: NDArray[np.float64], mask: ArrayLike | None = None) -> NDArray[np.bool_]:
-    """Return which points (n,) have finite coordinates, and are in the mask where there is one.
-
-    StageError where its shape differs.
-    """
+    """Return which points (n,) are finite and in the mask, if any; StageError for another shape."""
     use = np.logical_and.reduce([np.isfinite(axis) for axis in axes])
     if mask is None:
         return use
@@ -77,7 +71,7 @@ def levels(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Order points (n,) by cell and height: return the order, and which begin a vertical layer.
 
-    The numbers of cells are small ones.
+    Cells are numbered from 0 on, nearly without gaps.
 
     A cell's points are parted where a gap is wide: the ground and the deck over it, a roof and what
     it stands on. The lowest points of levels are levels again, each by itself, so they stand for

@@ -76,9 +76,7 @@ def linked_cells(
     reach: float,
     step: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Link cells to sets: return each cell's set (h, w), sizes, and :func:`longest_sides` (n,).
-
-    The set is -1 in holes.
+    """Link cells to sets: return sets (h, w), -1 in holes, sizes and :func:`longest_sides` (n,).
 
     Cells at most `reach` away from each other are linked across a `step` of meters, by the distance
     in cells.
@@ -100,10 +98,7 @@ def linked_cells(
 def longest_sides(
     label: NDArray[np.int64], places: Sequence[NDArray[np.int64]], count: int
 ) -> NDArray[np.int64]:
-    """Return the longest side of each of `count` sets of places.
-
-    It is the largest difference along an axis.
-    """
+    """Return the largest extent along an axis of each of `count` sets of places."""
     sides = np.zeros((len(places), count), np.int64)
     for side, at in zip(sides, places, strict=True):
         first, last = np.full((2, count), at[0] if len(at) else 0)

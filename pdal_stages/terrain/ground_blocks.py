@@ -49,10 +49,7 @@ def _reach_of_ground(options: FilterOptions) -> int:
 
 @dataclass(frozen=True)
 class GroundCells:
-    """The cells of a :class:`.surface.GroundRaster` that are not empty, in blocks.
-
-    They have a height, an opening, or ground points.
-    """
+    """Cells of a :class:`.surface.GroundRaster` that are not empty, in blocks."""
 
     #: Each has its cells in squares of `SQUARE_SIDE` cells by their names, as records, see
     #: `_record`. Saved ones are read when they are asked for, and not kept.
@@ -124,8 +121,7 @@ def reduced_points(
 ) -> tuple[NDArray[np.float64], dict[tuple[int, int], NDArray[np.float64]]]:
     """Return what blocks need of points that may be ground, in meters.
 
-    The lowest of each cell (n, 3), and all (m, 3) by the block that holds them. Blocks have
-    `BLOCK_SIDE` cells along a side.
+    That is the lowest of each cell (n, 3), and all (m, 3) by the block that holds them.
     """
     rows = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     xyz = np.column_stack([axis[rows] for axis in (x, y, z)])
@@ -144,9 +140,7 @@ def cells_of_block(
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
 ) -> dict[str, NDArray[np.void]]:
-    """Compute the cells of a block, column and row of a grid of blocks of `BLOCK_SIDE` cells.
-
-    They are one of the blocks of a :class:`GroundCells`.
+    """Compute the cells of one block of a :class:`GroundCells`, by column and row of the blocks.
 
     `outer` are the lowest points (n, 3) of :func:`reduced_points`: all within
     :func:`reach_of_block` cells of the block, and few more. `points` are all that may be ground in

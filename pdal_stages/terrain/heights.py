@@ -195,10 +195,7 @@ def _known_pieces(
 def _given_pieces(
     points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_]
 ) -> Iterator[_Piece]:
-    """Yield pieces of the cloud with the raster of the points (n,) that are `ground`.
-
-    These are surveyed, edited, or found by another program.
-    """
+    """Yield pieces of the cloud with the raster of the points (n,) that are given as `ground`."""
     margin = RIM + FILL_RINGS + max([0, *options.requested_radii])
     for rows, core in patches(points.column, points.row, options.reach_of_given, options.link):
         part = points.take(rows)

@@ -129,10 +129,7 @@ def _supported(base, rules):
 
 @device
 def _has_company(base, supported, side, j, i, z, plane, rules):
-    """Tell whether enough other columns are about as deep as z.
-
-    They lie at least `company_depth` as far below the plane.
-    """
+    """Tell whether enough other columns lie `company_depth` times as deep as z below the plane."""
     h, w = base.shape
     far, company = int(np.ceil(rules.far_m / side)), 0
     least = rules.company_depth * (plane[0] - z)
@@ -149,10 +146,7 @@ def _has_company(base, supported, side, j, i, z, plane, rules):
 
 @njit
 def _limits(low, base, supported, side, depth, limit, rules):
-    """Fill `limit` with the height below which each low place is an outlier.
-
-    It is -inf where the place may be ground.
-    """
+    """Fill `limit`: below it low places are outliers; -inf where one may be ground."""
     for j in range(low.shape[0]):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:

@@ -56,10 +56,7 @@ _FILL = 1.5
 
 
 def _corners(x, y, cell: float, resolution: float):
-    """Return the keys of the four coarse cells around each point's fine cell (4, n).
-
-    And where between them its middle lies, from 0 to 1.
-    """
+    """Return keys (4, n) of the coarse cells around fine cells, and where between these lie."""
     u, v = ((np.floor(axis / resolution) + 0.5) * (resolution / cell) - 0.5 for axis in (x, y))
     i, j = cell_numbers(u, 1.0), cell_numbers(v, 1.0)
     return np.array([cell_keys(i + a, j + b) for b in (0, 1) for a in (0, 1)]), u - i, v - j

@@ -205,10 +205,7 @@ class Voxels:
 
 
 def density(voxels: Voxels) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean number of points in a column around each voxel (n,), and their spacing.
-
-    In meters, over 3 x 3 blocks.
-    """
+    """Return points per column (n,) and spacing in meters, over 3 x 3 blocks around voxels."""
     row, column, _ = voxels.places
     wide = voxels.width // BLOCK
     block = (row // BLOCK) * wide + column // BLOCK
@@ -295,7 +292,7 @@ def small_clusters(
 def _mark_high(place, lowest, suspect, gaps, top, hanging, rules, verdict):
     """Mark the suspects that lie above everything near, and are not part of a line.
 
-    `gaps` (n,) are the least distances, in meters.
+    `gaps` (n,) are their least distances to other voxels, in meters.
     """
     h, w = top.shape
     near = np.empty((3, (2 * rules.far + 1) ** 2))
@@ -321,9 +318,7 @@ def _mark_high(place, lowest, suspect, gaps, top, hanging, rules, verdict):
 
 @device
 def _in_line(hanging, j, i, z, near, rules):
-    """Tell whether hanging voxels are strung along a line through a place, as wires are.
-
-    Or single points of them.
+    """Tell whether hanging voxels, as of wires, are strung along a line through a place.
 
     `hanging` are the heights (h, w) of hanging voxels, and which are suspects; `near` (3, m) is
     working memory.

@@ -116,10 +116,7 @@ def _fill_ring(heights, known):
 
 
 def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the raster (h, w) with the holes near measured cells filled, in meters.
-
-    Up to `FILL_RINGS` cells away, ring by ring.
-    """
+    """Return the raster (h, w) in meters, with `FILL_RINGS` rings of holes filled."""
     filled = raster.copy()
     known = np.flatnonzero(raster != HOLE)
     for _ in range(FILL_RINGS):
@@ -130,10 +127,7 @@ def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
 def openings_of(
     raster: NDArray[np.float32], radii: Iterable[int]
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield radii in cells, ascending, and the openings (h, w) of a minimum grid by octagons.
-
-    Heights are in meters.
-    """
+    """Yield ascending radii in cells and openings (h, w) by octagons in meters."""
     # Erosion is the maximum of what is upended. The ceiling keeps windows from holes.
     ceiling = np.where(raster != HOLE, HOLE, -HOLE)
     lowest_upended = np.where(raster != HOLE, -raster, -HOLE)

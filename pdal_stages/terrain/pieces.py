@@ -35,7 +35,7 @@ def patches(
 ) -> Iterator[tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]]:
     """Yield the points of a piece with those around that matter, and which belong to the piece.
 
-    Both as indices or masks, or a slice where they are all.
+    Both are indices or masks, or a slice for all points.
 
     Every point belongs to one piece. Points more than `reach` cells away, along either axis, do not
     matter; nor do points that no chain of others connects with steps of at most `link` cells. One
@@ -65,9 +65,7 @@ def patches(
 
 
 def refuse_scattered(counts: Collection[int]) -> None:
-    """Refuse points that are alone in most of their places.
-
-    Each would take milliseconds, and none tells anything.
+    """Refuse points that are alone in most of their places: each costs milliseconds for nothing.
 
     `counts` are the points of each place.
     """

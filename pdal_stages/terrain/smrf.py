@@ -61,10 +61,7 @@ SPREAD_SHARE = 0.25
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """Options of :func:`.heights.filtered_ground`; lengths in meters.
-
-    Wrong ones raise an :class:`OptionError`.
-    """
+    """Options of :func:`.heights.filtered_ground`, in meters; OptionError for wrong ones."""
 
     cell: float = 1.0
     slope: float = 0.1
@@ -116,10 +113,7 @@ class FilterOptions:
         height: NDArray[np.float64],
         gradient: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Return which of the points to `use` are ground.
-
-        They are so by their heights above the surface and its slope there; NaN is not.
-        """
+        """Return which points to `use` are ground by their height and slope; NaN is not."""
         return use & (np.abs(height) <= self.threshold + self.scalar * gradient)
 
     @property

@@ -71,9 +71,7 @@ def reach(levels: int) -> int:
 
 @device
 def blend(planes, i, j, s, t, size):
-    """Return height and gradient of the four planes around a place, weighted by nearness.
-
-    NaN where none is known.
+    """Return height and gradient of four planes around a place, by nearness; NaN if none is known.
 
     The place lies `s` and `t` (0 to 1) blocks of `size` cells beyond the center of block (j, i):
     given apart, so that rounding does not depend on where the array begins.
@@ -170,10 +168,7 @@ def _moments_of_blocks(fine, size, left, bottom, out, out_left, out_bottom):
 
 @njit
 def _mark_parents(needed, left, bottom, parents, parents_left, parents_bottom):
-    """Mark the blocks of the next coarser level that `from_parents` blends for needed ones.
-
-    Both (h, w).
-    """
+    """Mark the coarser blocks (h, w) that `from_parents` blends for needed blocks (h, w)."""
     for j in range(needed.shape[0]):
         for i in range(needed.shape[1]):
             if needed[j, i]:
@@ -200,10 +195,7 @@ def _coarsest(moments, size, needed, planes):
 
 @njit
 def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, planes):
-    """Evaluate the planes of blocks of twice the `size` at the centers of the needed blocks.
-
-    These have the side `size`, in cells.
-    """
+    """Evaluate planes of blocks of 2 `size` cells at centers of needed ones of `size` cells."""
     for j in range(needed.shape[0]):
         for i in range(needed.shape[1]):
             if needed[j, i]:
@@ -214,10 +206,7 @@ def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, pl
 
 @njit
 def _fit(moments, size, needed, planes):
-    """Correct the needed planes by the ground of 3 x 3 blocks.
-
-    They are given as the coarser level has them.
-    """
+    """Correct the needed planes, as the coarser level has them, by the ground of 3 x 3 blocks."""
     h, w = moments.shape[:2]
     sums = np.empty(9)
     for j in range(h):

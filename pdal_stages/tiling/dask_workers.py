@@ -72,10 +72,7 @@ class Cluster(contextlib.AbstractContextManager):
             raise _lost() from None
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """Wait for the first futures that are done.
-
-        StageError where a worker is unsuitable, or the cluster is lost.
-        """
+        """Wait for the first futures that are done; StageError if workers or cluster fail."""
         last_seen = time.monotonic()
         while True:
             done = wait(list(futures), timeout=_ASK, return_when=FIRST_COMPLETED).done

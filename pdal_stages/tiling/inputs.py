@@ -103,10 +103,7 @@ class InputSource:
 
 
 def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
-    """Return the inputs of readers: names, patterns, tile indexes.
-
-    PipelineError where one cannot be cut.
-    """
+    """Return the inputs of readers: names, patterns, tile indexes; refuse other readers."""
     sources: dict[str, InputSource] = {}
     for reader in readers:
         options = {k: v for k, v in reader.items() if k not in ("filename", "tag", "inputs")}
@@ -137,10 +134,7 @@ def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
 
 
 def las_extent(path: str) -> Extent:
-    """Return the number of points and the bounding box in the header of a LAS or LAZ file.
-
-    StageError where these cannot be read.
-    """
+    """Return the number of points and the bounding box in the header of a LAS or LAZ file."""
     try:
         header = las.read_header(path)
     except OSError as error:

@@ -253,7 +253,7 @@ def block_bytes(blocks: Blocks, area_m2: float) -> float:
 def worker_bytes(points_read: float, largest_file: float, block: float = 0.0) -> float:
     """Return the bytes of a worker that reads so many points of a tile and of an output file.
 
-    `block`: see :func:`block_bytes`.
+    `block` is the result of :func:`block_bytes`.
     """
     assembled = min(largest_file, MOST_AT_ONCE) * FILE_POINT
     return BASE + max(points_read * TILE_POINT + STAGES, assembled, block)
@@ -267,10 +267,7 @@ def fits_whole(points: int, memory: int | None) -> bool:
 def choose_tiles(
     options: TilingOptions, density: Density, halo_units: float, block: float = 0.0
 ) -> tuple[TilingOptions, TileGrid]:
-    """Choose tiles and the number of workers that fit into memory.
-
-    OptionError where no tile fits.
-    """
+    """Choose tiles and the number of workers that fit into memory, or refuse."""
     whole = options.memory or free_memory() // 2
     local = 0 if options.scheduler else options.local_workers
     fixed = options.workers is not None or local <= 1

@@ -369,10 +369,7 @@ def _for_workers(step: _Step) -> dict[str, Any]:
 def outputs_for(
     plan: TilePlan, inputs: Sequence[str], tiles: Sequence[str] | None = None
 ) -> list[list[str]]:
-    """Return the output of each writer for every input, or every tile by name.
-
-    StageError where one cannot be written.
-    """
+    """Return each writer's output for every input, or tile by name; StageError if not writable."""
     paths_of_writers = []
     for writer in plan.writers:
         name = os.path.abspath(writer["filename"])

@@ -289,8 +289,8 @@ class _Run:
     def find_jobs(self) -> None:
         """Find all tiles and outputs; those with unreadable inputs fail.
 
-        Their marks are fingerprints of everything that affects a result, including every input that
-        may be read for it.
+        A job's mark is a fingerprint of everything that affects its result, including every input
+        that may be read for it.
         """
         plan, survey, grid = self.plan, self.survey, self.survey.grid
         sees = plan.sees_m / survey.unit

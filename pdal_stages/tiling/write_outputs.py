@@ -232,10 +232,7 @@ def write_file(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Write the outputs of a file from the results of its tiles; return the record.
-
-    It has class counts.
-    """
+    """Write a file's outputs from the results of its tiles; return the record with class counts."""
     assert source.index is not None
     count = source.index.count
     tail = with_dimensions(plan.tail, plan.extra_dims, [source.path])
