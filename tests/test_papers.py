@@ -13,6 +13,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "benchmarks" / "papers"
 if str(FOLDER) not in sys.path:
     sys.path.insert(0, str(FOLDER))
 
+import b16_experiments  # noqa: E402
 import clouds  # noqa: E402
 import h17_oakland  # noqa: E402
 import kit  # noqa: E402
@@ -20,6 +21,7 @@ import pts_input  # noqa: E402
 import scenes  # noqa: E402
 import w18  # noqa: E402
 
+from pdal_stages.classifier.training_options import RECIPES  # noqa: E402
 from pdal_stages.features import compute_features  # noqa: E402
 
 #: The town's ASPRS codes -> labels of the Vaihingen files that they stand in for.
@@ -110,6 +112,10 @@ def scene(folder, tmp_path_factory):
     return scenes.load(
         folder, "town", cache, classes=(1, 2, 5, 8), neighborhoods="c1,c2,c3,c5,kopt"
     )
+
+
+def test_b16_searches_the_trees_of_the_recipe():
+    assert b16_experiments.TREES is RECIPES["blomley2016"]["trees_grid"]
 
 
 def test_w18_run(scene):

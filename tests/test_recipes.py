@@ -26,6 +26,8 @@ from pdal_stages.tiling.train_survey import TrainTask
 #: Features of a recipe, by the texts: [B16 3.1, 3.2.1], [W18 3.1, 3.2], [H17 2.2].
 FEATURES = {"blomley2016": 312, "weinmann2018": 560, "he2017": 6}
 
+HEIGHT = "HeightAboveGround"
+
 
 def growth(**options):
     """Options of growing trees on all samples."""
@@ -35,6 +37,15 @@ def growth(**options):
 @pytest.mark.parametrize("name", FEATURES)
 def test_a_recipe_has_as_many_features_as_the_text_says(name):
     assert len(feature_plan(TrainingOptions(**RECIPES[name])).names) == FEATURES[name]
+
+
+@pytest.mark.parametrize("name, height", [("blomley2016", "Z"), ("weinmann2018", HEIGHT)])
+def test_the_height_stays_where_other_neighborhoods_are_named(name, height):
+    """It is a feature by itself, beside those of the neighborhoods [B16 3.2.1, W18 3.2]."""
+    options = with_recipe({"recipe": name, "neighborhoods": "c1,c2,c3,c5"})
+    del options["recipe"]
+    names = feature_plan(TrainingOptions(**options)).names
+    assert len(names) == 4 * 62 + 1 and names[-1] == height
 
 
 def test_the_networks_recipe():

@@ -22,6 +22,7 @@ from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.base.asprs import class_name
+from pdal_stages.classifier.training_options import RECIPES
 from pdal_stages.features.registry import GROUPS
 
 NEIGHBORHOODS = {
@@ -35,7 +36,7 @@ NEIGHBORHOODS = {
 }
 SETS = ("measures", "distributions", "both")
 COUNT = 1000
-TREES = (50, 100, 200)
+TREES = RECIPES["blomley2016"]["trees_grid"]
 EXPERIMENT = 3  # raised when runs mean something else than before, so that none is resumed
 
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from pdal_stages import TrainingCloud, TrainingOptions, hag_minima, train
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.classifier.training_options import RECIPES
+from pdal_stages.classifier.training_options import with_recipe
 from pdal_stages.reports.pictures import triptych
 
 #: Pixels of the longer side and colors of a picture: under 400 kB in a repository.
@@ -56,6 +56,13 @@ def read(data: Path, pattern: str) -> tuple[np.ndarray, np.ndarray, dict[str, np
     return xyz, labels, dimensions
 
 
+def options_of(recipe: str, more: dict[str, Any]) -> TrainingOptions:
+    """Return the options of a recipe with others beside it."""
+    options = with_recipe({"recipe": recipe, **more})
+    del options["recipe"]
+    return TrainingOptions(**options)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -66,9 +73,7 @@ def main() -> None:
     options = parser.parse_args()
     for recipe in options.only:
         (training, test, classes), more = MAPS[recipe]
-        chosen = TrainingOptions(
-            **{**RECIPES[recipe], "folds": 0, "classes": list(classes), **more}
-        )
+        chosen = options_of(recipe, {"folds": 0, "classes": list(classes), **more})
         xyz, labels, dimensions = read(options.data, training)
         model = train(TrainingCloud(xyz, labels, dimensions, name=recipe), chosen)
         xyz, truth, dimensions = read(options.data, test)

@@ -307,9 +307,9 @@ RECIPES: dict[str, dict[str, Any]] = {
     "blomley2016": {
         "neighborhoods": ("blomley2016",),  # 3.1 four cylinders and k_opt
         "feature_set": ("all",),  # 3.2 shape measures and shape distributions
-        "dimensions": (),  # 3.2.1 the height Z comes with the neighborhoods
+        "dimensions": ("Z",),  # 3.2.1 the height, whatever neighborhoods are named
         "count": 1_000,  # 4.2 N_E = 1000
-        "trees_grid": (50, 100, 200, 400),  # 4.2 grid search; its values are not stated
+        "trees_grid": (50, 100, 200),  # 4.2 grid search; its values are not stated
         **_BREIMAN,
     },
     # With `target` one class against all others [W18 3.3, 4.3].
