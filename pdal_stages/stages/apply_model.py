@@ -24,6 +24,7 @@ from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
+from ..terrain.smrf import FilterOptions
 from .base import Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
 from .points import Points, class_counts
@@ -33,7 +34,7 @@ from .preprocessing import as_json, same, with_given_ground
 HEIGHT = "HeightAboveGround"
 #: Distance from given ground, in meters, up to which points without the dimension Ground may become
 #: ground: the default threshold of filters.hag_morphological.
-_TOLERANCE_M = 0.5
+_TOLERANCE_M = FilterOptions.threshold
 #: Steps per 1 to which compact outputs round probabilities and the like. A power of two: the last
 #: bytes of the floats are then zero and compress to nothing.
 _STEPS = 64
@@ -103,7 +104,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         "boolean",
         False,
         "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is "
-        "1, or without that dimension within 0.5 m of it (HeightAboveGround)",
+        f"1, or without that dimension within {_TOLERANCE_M} m of it (HeightAboveGround)",
     )
     memory_mb: float
 
