@@ -119,7 +119,7 @@ def test_classes_to_keep_are_joined_by_the_ground():
     overrides, _ = parse_overrides(["--filters.modelclassifier.keep=9,17"])
     request = ClassifyRequest(overrides=tuple(overrides), bridges=True, given_ground=True)
     (bridges,) = (stage for stage in request.stages if stage["type"] == "filters.bridges")
-    assert stage_from(bridges).keep.codes == (9, 17, 2)
+    assert stage_from(bridges).keep.codes == (9, 17, 2, 11)
 
 
 @pytest.mark.pdal
@@ -137,7 +137,7 @@ def test_without_ground_there_is_none_to_take(tmp_path, capsys):
     las.write(tmp_path / "none.laz")
     words = ["classify", str(tmp_path / "none.laz"), str(tmp_path / "o.laz"), "--ground", "given"]
     assert main(words) == 1
-    assert "none of the points has class 2" in capsys.readouterr().err
+    assert "none of the points has class 2, 9 or 11" in capsys.readouterr().err
 
 
 @pytest.mark.pdal
@@ -160,3 +160,37 @@ def test_given_ground_in_a_pipeline_and_in_a_model(edited, tmp_path):
         load_model(tmp_path / "m.model").predict(np.asarray(las.xyz))  # without classes
     (warning,) = load_model(tmp_path / "m.model").outdated or [None]
     assert warning is None
+
+
+@pytest.fixture
+def harbor(tmp_path):
+    """A quay with a house, a road on it, and a basin whose water and road are labeled as such."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 120, 60_000), rng.uniform(0, 80, 60_000)
+    water, road = (x > 60) & (x < 110), (x > 40) & (x < 50)
+    house = (x > 10) & (x < 25) & (y > 20) & (y < 40)
+    cloud = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    cloud.header.scales = [0.001] * 3
+    cloud.x, cloud.y = x, y
+    cloud.z = np.where(water, 0.0, np.where(house, 9.0, 3.0)) + rng.normal(0, 0.02, len(x))
+    cloud.classification = np.select([water, road, house], [9, 11, 1], 2).astype(np.uint8)
+    cloud.return_number[:] = cloud.number_of_returns[:] = 1
+    cloud.write(tmp_path / "harbor.laz")
+    return tmp_path / "harbor.laz"
+
+
+@pytest.mark.pdal
+def test_water_and_roads_that_are_given_are_ground_and_keep_their_class(harbor, tmp_path):
+    before = np.asarray(laspy.read(harbor).classification)
+    _, codes, las = classified(harbor, tmp_path / "o.laz", "--bridges")
+    surface = before != 1
+    assert np.array_equal(codes[surface], before[surface])
+    assert np.percentile(np.abs(las["HeightAboveGround"][surface]), 95) < 0.25
+    assert np.mean(codes[~surface] == 6) > 0.9
+    heights = {"type": "filters.hag_morphological", "given_ground": True, "ground": True}
+    heights["openings"] = [5, 17]
+    classifier = {"type": "filters.modelclassifier", "model": "standard", "given_ground": True}
+    writer = {"type": "writers.las", "filename": str(tmp_path / "json.laz"), "extra_dims": "all"}
+    ps.run_pipeline([str(harbor), heights, classifier, writer])
+    result = laspy.read(tmp_path / "json.laz")
+    assert np.array_equal(result.classification, codes)

@@ -139,6 +139,37 @@ def test_terrain_and_surface_of_a_survey_show_no_tiles(ready_town, ready_halves,
     assert above.max() > 4 and np.quantile(above, 0.1) < 1.5
 
 
+@pytest.mark.parametrize("suffix", ["las", "LAZ"])
+def test_the_surface_is_the_highest_point_near_the_middle_of_a_cell(
+    tmp_path, write_las, pdal_program, suffix
+):
+    """Neither points from other cells nor withheld ones are in it; both suffixes are read."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 40, (2, 20_000))
+    x[:2], y[:2] = (0, 39.999), (0, 39.999)  # the raster begins at the first point
+    z = rng.uniform(0, 10, 20_000)
+    withheld = np.zeros(len(x), np.uint8)
+    withheld[100:300] = 1
+    z[withheld == 1] = 250.0
+    arrays = {"X": x, "Y": y, "Z": z, "Withheld": withheld, "HeightAboveGround": z}
+    (tmp_path / "classified").mkdir()
+    for point_format in (1, 6):
+        source = tmp_path / "classified" / f"a.{suffix}"
+        write_las(source, dict(arrays), point_format=point_format, offset=[0, 0, 0])
+        command = [pdal_program, "pipeline", str(FOLDER / "terrain-and-surface.json")]
+        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+        reader = {"type": "readers.gdal", "filename": str(tmp_path / "surface.tif")}
+        reading = Pipeline([{**reader, "header": "Z"}])
+        reading.execute()
+        cells, radius = reading.arrays[0], 1 / np.sqrt(np.pi)  # a circle with a cell's area
+        cells = cells[(cells["X"] > 0) & (cells["X"] < 40)]
+        assert len(cells) == 1600
+        for column, row, height in zip(cells["X"], cells["Y"], cells["Z"], strict=True):
+            distance = np.where(withheld == 0, np.hypot(x - column, y - row), np.inf)
+            low, high = (z[distance < radius + step].max() for step in (-0.001, 0.001))
+            assert low - 0.001 < height < high + 0.001
+
+
 # ---- flags of LAS 1.0-1.3, which PDAL before 2.6 reads as parts of the class -----------------------------
 
 

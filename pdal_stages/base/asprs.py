@@ -44,6 +44,8 @@ HIGH_VEGETATION = 5
 BUILDING = 6
 WIRE = 14  #: conductors
 BRIDGE = 17  #: bridge decks
+#: Classes of the terrain's surface, which ground that is given consists of: ground, water, road.
+TERRAIN = (GROUND, 9, 11)
 #: Codes that say nothing about the object: never classified, unclassified.
 UNLABELED = (0, 1)
 #: Overlap of strips, before LAS 1.4 had a flag for it.

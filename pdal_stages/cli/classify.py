@@ -39,7 +39,10 @@ def add_commands(parser: Parser) -> None:
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     add("output", help="A file, a folder, or a name with # for the input's")
     add("--model", default="standard", help="A model file or a shipped model (default: standard)")
-    ground = "given: points of class 2 are the ground, and stay so (default: found)"
+    ground = (
+        "given: points of the classes 2, 9 and 11 (ground, water, road) are the ground, and keep "
+        "their class (default: found)"
+    )
     add("--ground", choices=("found", "given"), default="found", help=ground)
     dimensions = (
         "Extra dimensions to write besides the input's own, e.g. Reliability,Margin,Probability_6, "

@@ -14,7 +14,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import NOISE
+from ..base.asprs import NOISE, TERRAIN
 from ..base.errors import StageError
 from ..base.grid import GridWindow, begins_run, cell_keys, cell_numbers, split_keys
 
@@ -32,7 +32,7 @@ class Kind(IntEnum):
 
 #: ASPRS classes of each kind.
 CLASSES: dict[Kind, tuple[int, ...]] = {
-    Kind.GROUND: (2, 9, 11),
+    Kind.GROUND: TERRAIN,
     Kind.BUILDING: (6,),
     Kind.TREE: (4, 5),
     Kind.SPAN: (13, 14),

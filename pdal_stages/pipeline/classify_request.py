@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..base.asprs import GROUND, OVERLAP
+from ..base.asprs import OVERLAP, TERRAIN
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.las_repair import extra_dimensions
 from ..classifier.model import loaded_model
@@ -51,7 +51,7 @@ class ClassifyRequest:
     bridges: bool = False  #: find bridge decks, where heights are those of `_GROUND`
     wires: bool = False  #: find wires, where heights are computed
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
-    given_ground: bool = False  #: points of class 2 are the ground, and stay so
+    given_ground: bool = False  #: points of the classes TERRAIN are the ground, and stay so
 
     @cached_property
     def _classifier(self) -> dict[str, Any]:
@@ -99,7 +99,7 @@ class ClassifyRequest:
             )
         prepared, keep_ground = self._prepared()
         noise: dict[str, Any] = {"type": "filters.detachednoise"}
-        where, others = self.where, f"Classification != {GROUND}"
+        where, others = self.where, " && ".join(f"Classification != {c}" for c in TERRAIN)
         if keep_ground:
             where = f"({where}) && {others}" if where else others
         if where:
@@ -140,7 +140,7 @@ class ClassifyRequest:
         kept = split_selection(shared.get("keep", OVERLAP))
         finders = {**shared}
         if keep_ground:
-            finders["keep"] = [*(kept if isinstance(kept, list) else [kept]), GROUND]
+            finders["keep"] = [*(kept if isinstance(kept, list) else [kept]), *TERRAIN]
         stages: list[dict[str, Any]] = []
         if self.bridges:
             stages.append({"type": "filters.bridges", **finders})

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import (
-    GROUND,
     HIGH_VEGETATION,
     LOW_VEGETATION,
     MEDIUM_VEGETATION,
+    TERRAIN,
     by_height,
 )
 from ..base.errors import OptionError
@@ -103,8 +103,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
     given_ground: bool = option(
         "boolean",
         False,
-        "Points of class 2 are the ground: they stay 2, and others become 2 only where Ground is "
-        f"1, or without that dimension within {_TOLERANCE_M} m of it (HeightAboveGround)",
+        "Points of the classes 2, 9 and 11 (ground, water, road) are the ground: they keep their "
+        "class, and others become 2 only where Ground is 1, or without that dimension within "
+        f"{_TOLERANCE_M} m of it (HeightAboveGround)",
     )
     memory_mb: float
 
@@ -216,7 +217,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         inside = points.inside
         current = points.class_codes
         if self.given_ground:
-            kept = kept | (current == GROUND)
+            kept = kept | np.isin(current, TERRAIN)
         points.tally("kept", inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         dimensions = {

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import GROUND
+from ..base.asprs import TERRAIN
 from ..base.errors import NoTerrainError
 from ..terrain.ground_blocks import (
     BLOCK_SIDE,
@@ -78,9 +78,9 @@ class HagMorphological(FarReaching):
     given_ground: bool = option(
         "boolean",
         False,
-        "Points of class 2 are the ground: nothing is filtered, heights are measured from them "
-        "alone, and Ground is 1 for them and for others that are as near to the surface as "
-        "threshold and scalar say",
+        "Points of the classes 2, 9 and 11 (ground, water, road) are the ground: nothing is "
+        "filtered, heights are measured from them alone, and Ground is 1 for them and for others "
+        "that are as near to the surface as threshold and scalar say",
     )
 
     def check(self) -> None:
@@ -140,10 +140,10 @@ class HagMorphological(FarReaching):
         usable = points.usable(self.ignore)
         wanted = points.wanting("HeightAboveGround", context.created_before)
         all_wanted = bool(wanted.all())
-        ground = usable & (points.class_codes == GROUND) if self.given_ground else None
+        ground = usable & np.isin(points.class_codes, TERRAIN) if self.given_ground else None
         if ground is not None and not ground.any():
             raise NoTerrainError(
-                "no ground is given: none of the points has class 2",
+                "no ground is given: none of the points has class 2, 9 or 11",
                 found=f"{points.count:,} points",
                 cure="Classify the ground first, or leave 'given_ground' out: ground is then found",
             )

@@ -253,7 +253,7 @@ class TerrainModels(_Showing):
         "and how far that is above the terrain."
     )
     command, stage = "pipeline", "filters.hag_morphological"
-    GROUND = ("Found by the filter", "Class 2 of the point cloud")
+    GROUND = ("Found by the filter", "Classes 2, 9 and 11 of the point cloud")
     listed = ("slope", "window", "threshold")
     handled = ("ground", "openings", "terrain_slope", "where")
 
@@ -264,7 +264,7 @@ class TerrainModels(_Showing):
         )
         parameter.setHelp(
             "Which points the terrain goes through: those that the filter below finds, or those "
-            "classified as ground"
+            "classified as ground, water or road"
         )
         self.addParameter(parameter)
         self.add_cell("Cell of the rasters")
@@ -305,7 +305,8 @@ class TerrainModels(_Showing):
         if "HEIGHTS" in chosen:
             job.append(raster(chosen["HEIGHTS"], side, "HeightAboveGround", "max"))
         if "TERRAIN" in chosen:
-            limits = "Classification[2:2]" if by_class else "Ground[1:1]"
+            given = "Classification[2:2],Classification[9:9],Classification[11:11]"
+            limits = given if by_class else "Ground[1:1]"
             job += [
                 {"type": "filters.range", "limits": limits},
                 {"type": "filters.delaunay"},
