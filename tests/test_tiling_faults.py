@@ -265,7 +265,7 @@ def _workers(parent: int) -> list[int]:
     for status in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             inside = int(status.read_text().rpartition(")")[2].split()[1]) == parent
-            if inside and b"spawn_main" in (status.parent / "cmdline").read_bytes():
+            if inside and b"base.processes" in (status.parent / "cmdline").read_bytes():
                 results.append(int(status.parent.name))
     return results
 
@@ -600,11 +600,10 @@ def test_large_tasks_that_no_worker_reads():
         with WorkerProcesses(1, 1) as workers:
             for killed in (True, False):
                 task = workers.submit(bytes(10**7).hex)
-                (process,) = workers._busy[task]._processes.values()
-                os.kill(process.pid, signal.SIGSTOP)
+                os.kill(workers._busy[task].pid, signal.SIGSTOP)
                 time.sleep(0.5)
                 if killed:
-                    process.kill()
+                    os.kill(workers._busy[task].pid, signal.SIGKILL)
                     workers.wait([task])
     """
     ended = subprocess.run(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-import multiprocessing
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 
 from .asprs import GROUND
 from .errors import OptionError, StageError, optional_import
+from .processes import PythonProcess
 
 
 def vector(name: str) -> Any:
@@ -67,19 +66,8 @@ def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
     )
     if not linked:
         return function(*arguments)
-    context = multiprocessing.get_context("spawn")
-    context.set_executable(_interpreter())
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(function, *arguments).result()
-
-
-def _interpreter() -> str:
-    """Return the path of Python's own program, also inside a program that embeds Python."""
-    if os.path.basename(sys.executable or "").startswith("python"):
-        return sys.executable
-    name = f"python3.{sys.version_info.minor}"
-    inside = (os.path.join(prefix, "bin", name) for prefix in (sys.prefix, sys.base_prefix))
-    return next((path for path in inside if os.access(path, os.X_OK)), "python3")
+    with PythonProcess() as process:
+        return process.call(function, *arguments)
 
 
 #: Between a file and a layer of it, as QGIS writes them.

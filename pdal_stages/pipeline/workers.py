@@ -1,34 +1,30 @@
-"""Worker processes on this machine: pools of one process each, so that one can die alone."""
+"""Tasks in this process or in workers on this machine, of which one can die alone."""
 
 from __future__ import annotations
 
 import gc
-import os
-import signal
 import sys
 import threading
 import time
 import traceback
-import types
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager, suppress
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import get_context, parent_process
-from typing import Any
+from typing import Any, Protocol
 
 from ..base import checks
 from ..base.errors import InterruptedStage, StageError
 from ..base.files import NO_ROOM
-from ..base.messages import PlainStream
+from ..base.processes import ProcessEnded, PythonProcess
 from ..base.progress import Progress
 from ..base.threads import CORES_VARIABLE, available_threads
 from .pdal import check_interrupt, deferred_interrupts
 
 #: The reason where a worker died.
-KILLED = "its worker process died: too little memory, or a crash in a library"
+KILLED = str(ProcessEnded())
 #: One task at a time in a process: PDAL's threads are ours, and memory is stated for one.
 _one_task = threading.Lock()
 
@@ -60,6 +56,19 @@ def perform_task(task: Callable[[], Any]) -> TaskResult:
             "peak_mb": _peak(),
         }
         return out
+
+
+class Workers(Protocol):
+    """What performs tasks: this process, others on this machine, or those of a cluster."""
+
+    slots: int  #: tasks at the same time
+    threads: int  #: threads of each task
+
+    def submit(self, task: Callable[[], Any]) -> Any:
+        """Send a task to a free worker; return what stands for its result."""
+
+    def wait(self, futures: Iterable[Any]) -> set[Any]:
+        """Wait for at least one; return those that are done."""
 
 
 def _reason(error: Exception) -> str:
@@ -111,113 +120,52 @@ class ThisProcess(AbstractContextManager):
 
 
 class WorkerProcesses(AbstractContextManager):
-    """Tasks in processes of their own, one at a time in each.
-
-    They end with this process, however that ends.
-    """
+    """Tasks in processes of their own, one at a time in each; they end with this process."""
 
     def __init__(self, slots: int, threads: int) -> None:
         self.slots, self.threads = slots, threads
-        self._idle: list[ProcessPoolExecutor] = []
-        self._busy: dict[Future, ProcessPoolExecutor] = {}
+        limits = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES_VARIABLE]
+        self._environment = dict.fromkeys(limits, str(threads)) | {"PDAL_STAGES_PROGRESS": "0"}
+        self._idle: list[PythonProcess] = []
+        self._busy: dict[Future, PythonProcess] = {}
+        self._waiting = ThreadPoolExecutor(slots)  # one thread waits for each process
 
     def __exit__(self, *exc: object) -> None:
         """End the processes."""
-        for pool in [*self._idle, *self._busy.values()]:
-            for process in list((pool._processes or {}).values()):
-                process.kill()
-                process.join(10.0)  # killed, it ends at once, unless the system waits for a disk
-            _stop_sending(pool)
-            pool.shutdown(cancel_futures=True)
+        for process in [*self._idle, *self._busy.values()]:
+            process.kill()
+        self._waiting.shutdown(cancel_futures=True)
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Send a task to a free worker."""
-        if self._idle:
-            pool = self._idle.pop()
-            future = pool.submit(perform_task, task)
-        else:
-            with _environment(self.threads):
-                try:
-                    pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
-                except OSError as error:
-                    what = "worker processes cannot be started"
-                    cure = "Make /dev/shm writable, or do without them: --workers 0"
-                    raise StageError(what, found=error, cure=cure) from None
-                future = pool.submit(perform_task, task)
-        self._busy[future] = pool
+        try:
+            process = self._idle.pop() if self._idle else PythonProcess(self._environment)
+        except OSError as error:
+            what = "worker processes cannot be started"
+            raise StageError(what, found=error, cure="Do without them: --workers 0") from None
+        future = self._waiting.submit(process.call, perform_task, task)
+        self._busy[future] = process
         return future
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one; return those that are done."""
         done = wait(list(futures), return_when=FIRST_COMPLETED).done
         for future in done:
-            pool = self._busy.pop(future)
-            if isinstance(future.exception(), BrokenExecutor):
-                _stop_sending(pool)
-                pool.shutdown()
+            process = self._busy.pop(future)
+            if future.exception() is None:
+                self._idle.append(process)
             else:
-                self._idle.append(pool)
+                process.kill()
         return done
 
 
-def _stop_sending(pool: Any) -> None:
-    """Drop a large task that a dead worker did not read.
-
-    Python before 3.11.5 would wait for it (gh-94777).
-    """
-    if sys.version_info < (3, 11, 5):
-        with suppress(OSError), open(os.devnull) as nothing:  # the pool's thread closes the reader
-            os.dup2(nothing.fileno(), pool._call_queue._reader.fileno())
-
-
-def _begin() -> None:
-    """Set up a worker process."""
-    os.dup2(2, 1)  # what libraries print is no result of the command
-    sys.stdout, sys.stderr = PlainStream(sys.stdout), PlainStream(sys.stderr)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-@contextmanager
-def _environment(threads: int) -> Iterator[None]:
-    """Set the environment for a process that is started meanwhile.
-
-    It gets its share of the cores, no modules of the current folder, and no Ctrl-C. The program is
-    not imported in it, so a script needs no ``if __name__ == "__main__"``.
-    """
-    names = [*(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL")), CORES_VARIABLE]
-    wanted = dict.fromkeys(names, str(threads))
-    wanted |= {"PDAL_STAGES_PROGRESS": "0", "PYTHONSAFEPATH": "1"}
-    before = {name: os.environ[name] for name in wanted if name in os.environ}
-    program = sys.modules["__main__"]
-    os.environ.update(wanted)
-    sys.modules["__main__"] = types.ModuleType("__main__")
-    with suppress(AttributeError):  # Windows
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = program
-        for name in wanted:
-            os.environ.pop(name)
-        os.environ.update(before)
-        with suppress(AttributeError):
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
 def run_tasks(
-    workers: Any, waiting: deque, task_of: Callable[[Any], Callable[[], Any]]
+    workers: Workers, waiting: deque, task_of: Callable[[Any], Callable[[], Any]]
 ) -> Iterator[tuple[Any, TaskResult]]:
     """Yield (item, result) for every waiting item, as they finish.
 
-    Items may be added after every result. `workers` have slots, submit and wait; `task_of` is
-    called for an item's task just before it is sent.
+    Items may be added after every result. `task_of` is called for an item's task just before it is
+    sent.
     """
     running: dict[Any, Any] = {}
     while waiting or running:
@@ -233,7 +181,7 @@ def _result_of(future: Any) -> TaskResult:
     error = future.exception()
     if error is None:
         return future.result()
-    if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # of Dask
+    if isinstance(error, ProcessEnded) or type(error).__name__ == "KilledWorker":  # of Dask
         return TaskResult(reason=KILLED)
     return TaskResult(reason=f"{type(error).__name__}: {error}")
 
