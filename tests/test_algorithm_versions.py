@@ -28,7 +28,7 @@ OPTIONS = {
     "filters.hag_minima": {},
     "filters.hag_morphological": {"ground": True, "terrain_slope": True, "openings": [5, 17]},
     "filters.multiscalefeatures": {
-        "neighborhoods": "c2,s3,k20,kopt,ropt,copt",
+        "neighborhoods": "c2,s3,k20,kopt,ropt,rdim,copt",
         "feature_set": [
             *("covariance", "geometric", "HeightAboveLowest", "surfaces"),
             *(f"{name}_{kind}" for name in SHAPE_FEATURES for kind in ("s3", "copt")),

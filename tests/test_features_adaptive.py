@@ -198,7 +198,7 @@ def test_features_of_kopt_and_k():
 @pytest.mark.parametrize("cloud", CLOUDS)
 def test_features_are_finite_and_those_of_each_neighborhood_alone(cloud):
     xyz = CLOUDS[cloud][:800]
-    tokens = ["k3", "k20", "kopt", "ropt", "copt"]
+    tokens = ["k3", "k20", "kopt", "ropt", "rdim", "copt"]
     together = compute_features(xyz, None, tokens, "all,HeightAboveLowest")
     assert np.isfinite(together.values).all() and (together["Density_kopt"] > 0).all()
     for token in tokens:
@@ -241,6 +241,37 @@ def test_ropt_is_the_oracle_s(cloud):
             assert table[M.N, i] == len(oracle.sphere(xyz, q, table[M.RADIUS, i]))
             inside = entropies[list(radii).index(table[M.RADIUS, i])]
             assert table[M.RADIUS, i] == r or abs(inside - min(entropies)) < 2e-9, f"query {i}"
+
+
+def dimensionality(members):
+    """Demantke et al. 2011: the entropy of (s1 - s2, s2 - s3, s3) / s1."""
+    values = np.linalg.eigvalsh(np.cov(members.T, bias=True))[::-1]
+    s1, s2, s3 = np.sqrt(np.maximum(values, 0))
+    shares = np.array([s1 - s2, s2 - s3, s3]) / s1
+    return -sum(share * np.log(share) for share in shares if share > 0)
+
+
+def test_rdim_has_the_lowest_entropy_of_dimensionality():
+    radii = radii_of(0.25, 2.0, 0.05)
+    other = 0
+    for xyz in CLOUDS.values():
+        queries = some(xyz, 25)
+        table, by_eigenentropy = choose(xyz, queries, "rdim"), choose(xyz, queries, "ropt")
+        other += np.count_nonzero(table[M.RADIUS] != by_eigenentropy[M.RADIUS])
+        for i, q in enumerate(queries):
+            spheres = [oracle.sphere(xyz, q, radius) for radius in radii]
+            entropies = [
+                dimensionality(entry)
+                if len(entry) >= 10 and np.ptp(entry, axis=0).max() > 0
+                else np.inf
+                for entry in spheres
+            ]
+            chosen = list(radii).index(table[M.RADIUS, i])
+            if np.isinf(entropies).all():
+                assert chosen == len(radii) - 1
+            else:
+                assert entropies[chosen] < min(entropies) + 1e-6, f"query {i}"
+    assert other > 20  # it is another neighborhood
 
 
 # ---- copt --------------------------------------------------------------------------------------------------

@@ -105,7 +105,7 @@ def test_feature_sets():
         ("c1", "linearty", "Linearity"),
         ("c1", "", "names no feature"),
         ("c1", 5, "text"),
-        ("c1", "Radius", "copt, kopt, ropt"),
+        ("c1", "Radius", "copt, kopt, rdim, ropt"),
         ("c1", "Linearity_c2", "none of the neighborhoods"),
         ("c9,q", "all", "unknown neighborhood"),
     ],

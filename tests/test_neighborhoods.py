@@ -28,6 +28,7 @@ def tokens(spec):
         ("kopt( 10 , 50 ),c1", ["kopt(10,50)", "c1"]),
         ("ropt(0.25,2,0.05)", ["ropt"]),
         ("ropt(0.3,1.5,0.1)", ["ropt(0.3,1.5,0.1)"]),
+        ("rdim(0.25,2,0.05), RDIM(0.5,2,0.05)", ["rdim", "rdim(0.5,2,0.05)"]),
         ("copt", ["copt"]),
         (["c1", "s1,s2"], ["c1", "s1", "s2"]),
         ("blomley2016", ["c1", "c2", "c3", "c5", "kopt"]),
@@ -64,6 +65,7 @@ def test_parses(spec, expected):
         ("ropt(0.1,2,0)", "ropt"),
         ("ropt(0.1,200,0.001)", "1000 radii"),
         ("ropt(a,b,c)", "unknown"),
+        ("rdim(1,2)", "rdim"),
         ("copt(1)", "no values"),
         ("weinman2018", "weinmann2018"),
         ("c1;c2", "unknown"),
@@ -80,7 +82,7 @@ def test_refuses(spec, word):
 def test_suffix_and_reach():
     result = {
         n.token: (n.suffix, n.reach, n.adaptive)
-        for n in parse_neighborhoods("c2.5,s1,k50,kopt,ropt,copt")
+        for n in parse_neighborhoods("c2.5,s1,k50,kopt,ropt,rdim,copt")
     }
     assert result == {
         "c2.5": ("c2_5", 2.5, False),
@@ -88,6 +90,7 @@ def test_suffix_and_reach():
         "k50": ("k50", None, False),
         "kopt": ("kopt", None, True),
         "ropt": ("ropt", 2.0, True),
+        "rdim": ("rdim", 2.0, True),
         "copt": ("copt", 3.0, True),
     }
     assert parse_neighborhoods("kopt(10,50)")[0].suffix == "kopt10_50"

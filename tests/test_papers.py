@@ -150,6 +150,10 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     np.testing.assert_array_equal(
         part.adaptive(0.05), np.column_stack([direct[f"{w}_copt"] for w in words])
     )
+    direct = compute_features(town.xyz, neighborhoods="rdim", feature_set=words)
+    rdim = part.table(h17_oakland.BY_DIMENSIONALITY, 0.03)
+    np.testing.assert_array_equal(rdim, np.column_stack([direct[f"{w}_rdim"] for w in words]))
+    assert len(h17_oakland.CURVE) == 9  # [H17 3.3, Figure 4]: 0.01 to 0.05 by 0.005
     assert 0.05 < (part.curvature >= 0.05).mean() < 0.95
     shares = h17_oakland.shares(part.labels, part.curvature, 0.0)
     assert all(share["points"] == share["scattered"] for share in shares.values())

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from pdal_stages import TrainingOptions
+from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
 from pdal_stages.classifier.random_forest import grow_forest
 from pdal_stages.classifier.sampling import draw_samples
@@ -19,6 +19,7 @@ from pdal_stages.classifier.training_options import (
     with_recipe,
 )
 from pdal_stages.features import FeaturePlan
+from pdal_stages.features.engine import fit_clouds
 from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.stages.registry import stage_from, stage_types
 from pdal_stages.tiling.train_survey import TrainTask
@@ -100,6 +101,28 @@ def _plain(value):
 def test_an_unknown_recipe_is_refused():
     with pytest.raises(OptionError, match="'recipe' must be one of"):
         with_recipe({"recipe": "weinman2018"})
+
+
+def test_the_threshold_of_copt_is_given_or_found():
+    """[H17 3.3]: 0.03, found on training and test points together, can be set in training."""
+    rng = np.random.default_rng(5)
+    flat, tree = rng.uniform(0, 20, (3000, 3)) * [1, 1, 0.001], rng.uniform(0, 6, (2000, 3))
+    cloud = TrainingCloud(np.vstack([flat, tree + 30]), np.repeat([2, 5], [3000, 2000]))
+    few = {"recipe": "he2017", "count": 100, "trees": 5, "folds": 0}
+
+    def trained(**more):
+        options = with_recipe({**few, **more})
+        del options["recipe"]
+        return train([cloud], TrainingOptions(**options)).passes[0].features.copt_threshold
+
+    assert trained(copt_threshold=0.03) == 0.03
+    assert 0.05 < trained() < 0.3
+    shapes = TrainingOptions(neighborhoods="copt", feature_set="D2", copt_threshold=0.03)
+    bins = [fit_clouds([cloud.xyz], feature_plan(shapes), copt_threshold=at) for at in (0, 1)]
+    assert [threshold for _, threshold in bins] == [0, 1]
+    assert bins[0][0].to_dict() != bins[1][0].to_dict()  # of the neighborhoods that it chooses
+    with pytest.raises(OptionError, match="'copt_threshold' is for the neighborhood copt"):
+        TrainingOptions(neighborhoods="kopt", copt_threshold=0.03)
 
 
 def test_random_samples_and_duplicates_beyond_the_largest_class():

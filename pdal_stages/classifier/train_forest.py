@@ -132,7 +132,13 @@ class ForestTraining:
         """Fit what the features need to the clouds that have samples."""
         options, plan = self.options, feature_plan(self.options)
         used = [self.clouds[number].xyz for number in np.unique(self.samples.cloud).tolist()]
-        bins, threshold = fit_clouds(used, plan, seed=options.seed, threads=options.threads)
+        bins, threshold = fit_clouds(
+            used,
+            plan,
+            copt_threshold=options.copt_threshold,
+            seed=options.seed,
+            threads=options.threads,
+        )
         return Features(plan, bins, threshold, options.seed)
 
     def _growth(self) -> TrainingOptions:

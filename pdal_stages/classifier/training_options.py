@@ -55,7 +55,7 @@ class TrainingOptions(Settings):
     neighborhoods: Any = setting(
         ("s5", "k10", "k20", "k50"),
         "list",
-        "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, copt) or a preset (blomley2016, "
+        "Neighborhoods: tokens (c2, s1, k50, kopt, ropt, rdim, copt) or a preset (blomley2016, "
         "weinmann2018, he2017)",
     )
     feature_set: Any = setting(
@@ -125,6 +125,13 @@ class TrainingOptions(Settings):
         "samples, which is "
         "what scaling to [0, 1] changes for trees",
         choices=("none", "percentiles"),
+    )
+    copt_threshold: float | None = setting(
+        None,
+        "number",
+        "Curvature from which on copt takes a point as scattered; default: by 2-means over the "
+        "training clouds",
+        *(0, 1),
     )
     min_samples_leaf: int = setting(3, "integer", "Minimum number of samples in a leaf", 1, 10**6)
     max_samples: float | None = setting(
@@ -231,6 +238,12 @@ class TrainingOptions(Settings):
         self._set(alsnet=trainer_of(self.algorithm).own_options(self.alsnet))
         if self.base is not None:
             self._check_base()
+        if self.copt_threshold is not None and not feature_plan(self).copt:
+            raise OptionError(
+                "'copt_threshold' is for the neighborhood copt",
+                found=", ".join(map(str, self.neighborhoods)),
+                cure="Leave it out, or name copt among the neighborhoods",
+            )
         passes = DEFAULT_PASSES if self.base is None else 1
         context = DEFAULT_CONTEXT if self.base is None else CONTEXT_OF_BASE
         self._set(

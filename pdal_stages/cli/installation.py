@@ -48,7 +48,7 @@ def add_commands(parser: Parser) -> None:
 
     what = "Compile the kernels now, so that later runs do not wait"
     add = parser.command("warmup", _warmup, what)
-    every = "Also the kernels of kopt, ropt, copt and shape distributions"
+    every = "Also the kernels of kopt, ropt, rdim, copt and shape distributions"
     add("--all", action="store_true", help=every)
 
 

@@ -1,12 +1,12 @@
-"""Neighborhoods whose size adapts to the points: k nearest, ``kopt``, ``ropt``, ``copt``.
+"""Neighborhoods whose size adapts to the points: k nearest, ``kopt``, ``ropt``, ``rdim``, ``copt``.
 
 All are chosen among nested ones, made of a query's neighbors in the order of distance, whose
 moments are summed up once. The k nearest are the point and its k nearest: n = k + 1 members, as in
-Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest eigenentropy.
-``copt`` looks at the curvature (surface variation) of the sphere of 1 m first: where it is at least
-c_t the point is *scattered* and takes the best k of 10..50 within 3 m, otherwise it is *regular*
-and takes the best radius of 0.5..2 m [H17]. The threshold c_t follows from the curvatures of the
-whole cloud.
+Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest eigenentropy,
+``rdim`` the radius with the lowest entropy of dimensionality. ``copt`` looks at the curvature
+(surface variation) of the sphere of 1 m first: where it is at least c_t the point is *scattered*
+and takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of
+0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
 
 A candidate needs members that do not all coincide: three of them where k is chosen
 (``moments.STRUCTURE_MEMBERS``), ten where a radius is (``neighborhoods.RADIUS_MEMBERS``). Where
@@ -45,6 +45,7 @@ from .registry import SURFACE_FEATURES, rows_of
 from .scale_selection import (
     add_up,
     eigenvalues_of,
+    lowest_dimensionality,
     lowest_entropy,
     write_moments,
 )
@@ -119,6 +120,7 @@ class Search(NamedTuple):
     choices: np.ndarray  # (n, 3) int64: columns as in CHOICE
     curved: bool = False  # copt: radii where the point is regular, ks where it is scattered
     threshold: float = math.nan  # curvature from which on a point is scattered
+    by_dimensionality: bool = False  # rdim: the lowest entropy of dimensionality is taken
 
 
 class Results(NamedTuple):
@@ -255,6 +257,8 @@ def _searches(chosen: list[Columns]) -> list[Search]:
         if neighborhood.kind == "copt":
             ks = np.arange(COPT_K[0], COPT_K[1] + 1)
             search = search._replace(ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
+        elif neighborhood.kind == "rdim":
+            search = search._replace(by_dimensionality=True)
         searches.append(search)
     return ([_by_number(ranges)] if ranges else []) + searches
 
@@ -388,6 +392,8 @@ def _choose(search, j, curvature, scratch):
     members = search.choices[j, CHOICE.members]
     if search.curved and curvature >= search.threshold:
         first, end, members = len(search.radii), len(scratch.ends), STRUCTURE_MEMBERS
+    if search.by_dimensionality:
+        return lowest_dimensionality(scratch.sums, first, end, members)
     return lowest_entropy(scratch.sums, first, end, members)
 
 

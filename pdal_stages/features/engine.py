@@ -405,7 +405,12 @@ def compute_features(
 
 
 def fit_clouds(
-    clouds: Sequence[npt.ArrayLike], plan: FeaturePlan, *, seed: int = 0, threads: int | None = None
+    clouds: Sequence[npt.ArrayLike],
+    plan: FeaturePlan,
+    *,
+    copt_threshold: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
 ) -> tuple[ShapeBins | None, float | None]:
     """Shape thresholds and the threshold of copt, fitted to several clouds as if to one.
 
@@ -413,13 +418,14 @@ def fit_clouds(
     neighborhoods [B16 3.2.2] are those round the points with the smallest hashes of all. A
     neighborhood lies within its own cloud. Of one cloud the result is :meth:`FeatureEngine.fit`'s;
     the order of the clouds (n, 3), in meters, does not matter. None where the plan has no shapes,
-    or no copt.
+    or no copt; a `copt_threshold` that is given stays.
     """
 
     def engine_of(number: int) -> FeatureEngine:  # one index at a time
         return FeatureEngine(clouds[number], plan, seed=seed, threads=threads)
 
-    return _fit(clouds, engine_of, FeatureEngine(np.zeros((0, 3)), plan, seed=seed))
+    like = FeatureEngine(np.zeros((0, 3)), plan, copt_threshold=copt_threshold, seed=seed)
+    return _fit(clouds, engine_of, like)
 
 
 def _fit(
@@ -452,5 +458,5 @@ def _fit(
 def warmup() -> None:
     """Compile every kernel and fill the cache, e.g. at installation."""
     xyz = np.random.default_rng(0).uniform(0.0, 3.0, (60, 3))
-    compute_features(xyz, None, "c1,s1,k5,kopt(2,5),ropt,copt", "all,surfaces", threads=1)
+    compute_features(xyz, None, "c1,s1,k5,kopt(2,5),ropt,rdim,copt", "all,surfaces", threads=1)
     compute_features(xyz, [0], neighborhoods="c1", feature_set="covariance", threads=1)

@@ -1,4 +1,4 @@
-"""Tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``copt``) and presets.
+"""Tokens (``c2``, ``s1``, ``k50``, ``kopt``, ``ropt``, ``rdim``, ``copt``) and presets.
 
 One token is used alike in options, dimension suffixes, model files and documents. Sources: [B16]
 Blomley, Jutzi, Weinmann 2016, doi:10.5194/isprsannals-III-3-169-2016; [W18] Weinmann, Blomley,
@@ -31,11 +31,14 @@ PRESETS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 KOPT_DEFAULT = (10.0, 100.0)  # k_min, k_max [B16]
 ROPT_DEFAULT = (0.25, 2.0, 0.05)  # r_min, r_max, step in meters [H17]
+#: Kinds that choose a radius: by the lowest eigenentropy, or by the lowest entropy of
+#: dimensionality (Demantke et al. 2011), which [H17] cites for its v_r.
+BY_RADIUS = ("ropt", "rdim")
 #: Kinds whose size is chosen point by point.
-ADAPTIVE = ("kopt", "ropt", "copt")
-_DEFAULTS = {"kopt": KOPT_DEFAULT, "ropt": ROPT_DEFAULT, "copt": ()}
-#: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt`` and ``copt``
-#: with fewer are not candidates, and the curvature is 1/3. The paper gives no number; with
+ADAPTIVE = ("kopt", *BY_RADIUS, "copt")
+_DEFAULTS = {"kopt": KOPT_DEFAULT, **dict.fromkeys(BY_RADIUS, ROPT_DEFAULT), "copt": ()}
+#: Members below which [H17]'s inadequate neighborhood begins: radii of ``ropt``, ``rdim`` and
+#: ``copt`` with fewer are not candidates, and the curvature is 1/3. The paper gives no number; with
 #: ten, its c_t of 0.03 and the counts of its Table 1 come out (docs/papers.md), with three they do
 #: not.
 RADIUS_MEMBERS = 10
@@ -58,15 +61,15 @@ MOST = 64
 #: tuned.
 SIDES = tuple(2.0**k for k in range(-3, 7))
 
-_KNOWN = ("c2", "s1", "k50", "kopt", "ropt", "copt", *PRESETS)
+_KNOWN = ("c2", "s1", "k50", *ADAPTIVE, *PRESETS)
 _NUMBER = r"(?:\d+(?:\.\d*)?|\.\d+)"
 _TOKEN = re.compile(
     rf"(?P<kind>[csk])(?P<size>{_NUMBER})"
-    rf"|(?P<adaptive>kopt|ropt|copt)(?:\((?P<values>{_NUMBER}(?:,{_NUMBER})*)\))?"
+    rf"|(?P<adaptive>{'|'.join(ADAPTIVE)})(?:\((?P<values>{_NUMBER}(?:,{_NUMBER})*)\))?"
 )
 _CURE = (
     "Write c2 (vertical cylinder of 2 m radius), s1 (sphere of 1 m), k50 (50 nearest), "
-    "kopt, kopt(10,100), ropt, ropt(0.25,2,0.05), copt, or a preset: " + ", ".join(PRESETS)
+    "kopt, kopt(10,100), ropt, ropt(0.25,2,0.05), rdim, copt, or a preset: " + ", ".join(PRESETS)
 )
 
 
@@ -74,10 +77,10 @@ _CURE = (
 class Neighborhood:
     """One neighborhood definition. Make it with :func:`parse_neighborhoods`."""
 
-    #: ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt`` or ``copt``.
+    #: ``cylinder``, ``sphere``, ``knn``, ``kopt``, ``ropt``, ``rdim`` or ``copt``.
     kind: str
-    #: Cylinder and sphere: (radius in meters,); knn: (k,); kopt: (k_min, k_max); ropt: (r_min,
-    #: r_max, step) in meters; copt: ().
+    #: Cylinder and sphere: (radius in meters,); knn: (k,); kopt: (k_min, k_max); ropt and rdim:
+    #: (r_min, r_max, step) in meters; copt: ().
     parameters: tuple[float, ...] = ()
 
     @property
@@ -100,7 +103,7 @@ class Neighborhood:
         """The farthest a member can be, in meters; ``None`` where a number of points decides."""
         if self.kind in ("cylinder", "sphere"):
             return self.parameters[0]
-        if self.kind == "ropt":
+        if self.kind in BY_RADIUS:
             return self.parameters[1]
         return COPT_REACH if self.kind == "copt" else None
 
@@ -188,10 +191,10 @@ def _parse_token(text: str) -> Neighborhood:
         rule = f"k must be a whole number from {least} to {MAX_K}, of kopt(k_min,k_max) two of them"
     elif kind == "copt":
         fine, rule = not values, "copt takes no values"
-    elif kind == "ropt":
+    elif kind in BY_RADIUS:
         fine = len(values) == 3 and MIN_RADIUS <= min(values) <= values[0] <= values[1]
         fine = fine and values[1] <= MAX_RADIUS and (values[1] - values[0]) / values[2] <= 1000
-        rule = f"ropt(r_min,r_max,step) takes at most 1000 radii from {MIN_RADIUS} m on"
+        rule = f"{kind}(r_min,r_max,step) takes at most 1000 radii from {MIN_RADIUS} m on"
     else:
         fine = MIN_RADIUS <= values[0] <= MAX_RADIUS
         rule = f"a radius must be from {MIN_RADIUS} to {MAX_RADIUS:g} meters"

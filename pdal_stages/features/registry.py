@@ -67,7 +67,7 @@ FEATURES = (
     Feature("Verticality", "geometric", "1", "1 - abs(nz)"),
     Feature("HeightRange", "geometric", "m", "highest minus lowest z"),
     Feature("HeightStd", "geometric", "m", "standard deviation of z (divisor n)"),
-    Feature("Radius", "geometric", "m", "the chosen radius; kopt, ropt and copt only",
+    Feature("Radius", "geometric", "m", "the chosen radius; kopt, ropt, rdim and copt only",
             ADAPTIVE),
     *(
         Feature(f"{metric}_{number}", "shapes", "1", f"share of pulls in bin {number}: {measured}")

@@ -1,9 +1,10 @@
-"""The best of nested neighborhoods: that of lowest eigenentropy [B16 eq. 1-2].
+"""The best of nested neighborhoods: that of lowest eigenentropy [B16 eq. 1-2] or dimensionality.
 
 The lowest eigenentropy is found in two steps. A vectorized closed form estimates all entropies to
 1e-7; those within ``MARGIN`` of the lowest are computed again by the exact method of the features.
 Entropies that then lie within ``TIE`` of each other count as equal, and the smallest neighborhood
-wins: in a perfect plane or line rounding noise would decide otherwise.
+wins: in a perfect plane or line rounding noise would decide otherwise. Entropies of dimensionality
+are all computed by the exact method.
 """
 
 from __future__ import annotations
@@ -185,3 +186,25 @@ def lowest_entropy(s, first, last, least_members):
         if entropy[j] <= least + TIE:
             return j
     return last - 1
+
+
+@device
+def lowest_dimensionality(s, first, last, least_members):
+    """Return the candidate with the lowest entropy of dimensionality; see :func:`lowest_entropy`.
+
+    That is the entropy of (s1 - s2, s2 - s3, s3) / s1, where s are the roots of the eigenvalues
+    (Demantke et al. 2011): it is lowest where a neighborhood is clearly a line, a plane or a
+    volume.
+    """
+    best, least = last - 1, NEVER
+    for j in range(first, last):
+        if s[M.N, j] < least_members:
+            continue
+        l1, l2, l3, spread = eigenvalues_of(s, j)
+        if l1 + l2 + l3 <= COINCIDENT * spread:
+            continue
+        s1, s2, s3 = math.sqrt(l1), math.sqrt(l2), math.sqrt(l3)
+        entropy = eigenentropy(s1 - s2, s2 - s3, s3)
+        if entropy < least - TIE:
+            best, least = j, entropy
+    return best

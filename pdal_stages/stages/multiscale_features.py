@@ -36,7 +36,7 @@ class MultiscaleFeatures(Stage):
     neighborhoods: list = option(
         "list",
         DEFAULT_NEIGHBORHOODS,
-        "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, copt) or a "
+        "Neighborhoods: tokens (c2 cylinder, s1 sphere, k50 nearest, kopt, ropt, rdim, copt) or a "
         "preset (blomley2016, weinmann2018, he2017)",
     )
     feature_set: list = option(
