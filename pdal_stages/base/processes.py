@@ -67,6 +67,9 @@ class PythonProcess(AbstractContextManager):
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_MAX_WAIT)
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):  # a call that it has not read
+                pipe.close()  # type: ignore[union-attr]
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function there that it can import; return its result or raise its error."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..base.messages import count_of, one_line, print_messages
 from .parser import INPUTS, Parser, add_stage_options, stage_options
@@ -119,10 +118,6 @@ def _classify(options: argparse.Namespace) -> int:
 def _classify_whole(task: ClassifyTask, options: argparse.Namespace) -> TiledRun:
     """Classify one file in one piece, and print the result."""
     end_at_ctrl_c(options.is_program)
-    if options.is_program and not options.polygons:
-        # laspy imports them for nothing, half of its time.
-        absent: Any = dict.fromkeys({"requests", "pyproj"} - sys.modules.keys())
-        sys.modules.update(absent)
     run = task.run_whole(dry_run=options.dry_run)
     if options.dry_run:
         print("1 input, in one piece")

@@ -39,10 +39,10 @@ def add_commands(parser: Parser) -> None:
     what = "Build our stages into PDAL itself, for all programs that use it"
     parser.command("plugin", _plugin, what)
     command = parser.commands["plugin"]
-    step = command.add_mutually_exclusive_group(required=True)
-    step.add_argument("--install", action="store_true", help="Compile them, beside filters.python")
-    step.add_argument("--check", action="store_true", help="Say what is there and what is missing")
-    step.add_argument("--uninstall", action="store_true", help="Remove them")
+    add = command.adder_to(command.add_mutually_exclusive_group(required=True))
+    add("--install", action="store_true", help="Compile them, beside filters.python")
+    add("--check", action="store_true", help="Say what is there and what is missing")
+    add("--uninstall", action="store_true", help="Remove them")
     folder = "Another folder; PDAL_DRIVER_PATH must name it and the folder of filters.python"
     command.add_argument("--folder", type=Path, metavar="DIR", help=folder)
 
@@ -118,9 +118,10 @@ def _commands(main_parser: Parser, options: argparse.Namespace) -> None:
     from ..classifier.model_file import shipped
     from ..stages.registry import stage_types
 
-    def describe_command(parser: argparse.ArgumentParser) -> dict[str, Any]:
-        shown = (a for a in parser._actions if a.help != argparse.SUPPRESS and a.dest != "help")
-        return {"help": parser.description, "arguments": [_argument(action) for action in shown]}
+    def describe_command(parser: Parser) -> dict[str, Any]:
+        shown = (a for a in parser.arguments if a.help != argparse.SUPPRESS and a.dest != "help")
+        arguments = [_argument(action, action in parser.repeatable) for action in shown]
+        return {"help": parser.description, "arguments": arguments}
 
     def describe_option(option: Any) -> dict[str, Any]:
         shown = option.typed_default if isinstance(option.default, tuple) else option.default
@@ -140,7 +141,7 @@ def _commands(main_parser: Parser, options: argparse.Namespace) -> None:
     print(json.dumps(content, indent=1))
 
 
-def _argument(action: argparse.Action) -> dict[str, Any]:
+def _argument(action: argparse.Action, many: bool) -> dict[str, Any]:
     switch = action.nargs == 0
     of_choices = type(next(iter(action.choices))) if action.choices else None
     value_type: Any = action.type or of_choices
@@ -156,7 +157,7 @@ def _argument(action: argparse.Action) -> dict[str, Any]:
         "default": default if isinstance(default, bool | int | float | str) else None,
         "choices": list(action.choices or ()),
         "required": bool(action.required),
-        "many": action.nargs in ("+", "*") or isinstance(action, argparse._AppendAction),
+        "many": many,
         "value": action.metavar if isinstance(action.metavar, str) else "",
     }
 

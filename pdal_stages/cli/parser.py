@@ -6,7 +6,8 @@ import argparse
 import importlib
 import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 from ..base.errors import StageError, suggest
@@ -53,12 +54,8 @@ def parse(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     parser.add_argument("--version", action="version", version=f"pdal-stages {__version__}")
     module_of = {command: module for module, names in COMMANDS.items() for command in names}
     modules = [module_of[words[0]]] if words and words[0] in module_of else COMMANDS
-    for module in modules:
-        importlib.import_module(f".{module}", __package__).add_commands(parser)
-    if "--help-all" in words:
-        words = ["--help" if word == "--help-all" else word for word in words]
-        for command_parser in parser.commands.values():
-            command_parser.rare = ()
+    parser.add_commands(modules, shows_all="--help-all" in words or words[:1] == ["commands"])
+    words = ["--help" if word == "--help-all" else word for word in words]
     if not words or words[0] not in parser.commands:
         parser.parse_args(words or ["--help"])  # prints help, the version or what is wrong; exits
     command = parser.commands[words[0]]
@@ -67,7 +64,7 @@ def parse(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
             command.error(f"what follows '{word or before}' is empty: is a shell variable unset?")
     options, unknown = command.parse_known_intermixed_args(words[1:])
     if unknown:
-        near = suggest(unknown[0].partition("=")[0], command._option_string_actions)
+        near = suggest(unknown[0].partition("=")[0], command.flags)
         command.error(f"unrecognized arguments: {' '.join(unknown)}. {near}".rstrip(". "))
     if overrides and not options.takes_overrides:
         raise StageError(f"'{words[0]}' takes no stage options", found=overrides[0].flag)
@@ -76,39 +73,50 @@ def parse(arguments: Sequence[str], is_program: bool) -> argparse.Namespace:
     return options
 
 
-class _OneScreen(argparse.HelpFormatter):
-    """Show only required arguments in usage, and ``--[no-]flag`` for both ways of a switch."""
-
-    def _format_usage(self, usage, actions, groups, prefix):
-        """Format usage with the required arguments."""
-        needed = [action for action in actions if action.required or not action.option_strings]
-        return super()._format_usage(usage, needed, [], prefix)
-
-    def _format_action_invocation(self, action):
-        """Format a flag as it stands before its help."""
-        if isinstance(action, argparse.BooleanOptionalAction):
-            return f"--[no-]{action.option_strings[0][2:]}"
-        return super()._format_action_invocation(action)
-
-
 class Parser(argparse.ArgumentParser):
-    """Suggest similar choices, add commands, and keep their help to one screen."""
+    """Suggest similar choices, list commands and arguments, and keep help to one screen."""
 
-    #: Arguments that only ``--help-all`` shows.
-    rare: Sequence[str] = ()
+    def __init__(self, **settings: Any) -> None:
+        #: The arguments, in the order of their declaration, and which may be repeated.
+        self.arguments: list[argparse.Action] = []
+        self.repeatable: list[argparse.Action] = []
+        #: Arguments that help shows only where all are to be shown.
+        self.rare: Sequence[str] = ()
+        self.shows_all = False
+        self.commands: dict[str, Parser] = {}
+        one_screen = partial(argparse.HelpFormatter, max_help_position=24)
+        super().__init__(formatter_class=one_screen, **settings)
 
-    def _get_formatter(self) -> _OneScreen:
-        return _OneScreen(f"{self.prog} [options]", max_help_position=24)
+    def add_argument(self, *flags: Any, **declared: Any) -> Any:
+        """Add an argument, and list it."""
+        return self._list(super().add_argument(*flags, **declared), declared)
+
+    def adder_to(self, group: Any) -> Callable:
+        """Return the function that adds arguments to a group of this parser, and lists them."""
+        return lambda *flags, **declared: self._list(
+            group.add_argument(*flags, **declared), declared
+        )
+
+    def _list(self, action: argparse.Action, declared: dict[str, Any]) -> argparse.Action:
+        self.arguments.append(action)
+        if declared.get("action") == "append" or action.nargs in ("+", "*"):
+            self.repeatable.append(action)
+        if action.dest in self.rare and not self.shows_all:
+            action.help = argparse.SUPPRESS
+        needed = [a for a in self.arguments if a.required or not a.option_strings]
+        shown = map(_usage_of, sorted(needed, key=lambda a: not a.option_strings))
+        self.usage = " ".join(["%(prog)s [options]", *shown])
+        return action
+
+    @property
+    def flags(self) -> list[str]:
+        """All flags, as they are written."""
+        return [flag for action in self.arguments for flag in action.option_strings]
 
     def format_help(self) -> str:
         """Return what ``--help`` prints."""
-        hidden = {action: action.help for action in self._actions if action.dest in self.rare}
-        for action in hidden:
-            action.help = argparse.SUPPRESS
-        text = super().format_help() + "\n--help-all shows all options.\n" * bool(hidden)
-        for action, help in hidden.items():
-            action.help = help
-        return text
+        hides = self.rare and not self.shows_all
+        return super().format_help() + "\n--help-all shows all options.\n" * bool(hides)
 
     def error(self, message: str) -> NoReturn:
         """Print usage and a message with the nearest choice, and exit."""
@@ -116,12 +124,15 @@ class Parser(argparse.ArgumentParser):
             message += f". {suggest(choice[1], _WORD.findall(choice[2]))}".rstrip(". ")
         super().error(message)
 
-    @property
-    def commands(self) -> dict[str, Parser]:
-        """The commands by name."""
-        if self._subparsers is None:
-            self.add_subparsers(prog=self.prog, dest="command", required=True, metavar="COMMAND")
-        return self._subparsers._group_actions[0].choices  # type: ignore
+    def add_commands(self, modules: Iterable[str], shows_all: bool) -> None:
+        """Add the commands of modules of this room; where all is shown, with rare arguments."""
+        self.shows_all = shows_all
+        self._adding = self.add_subparsers(
+            prog=self.prog, dest="command", required=True, metavar="COMMAND"
+        )
+        self.usage = "%(prog)s [options] COMMAND ..."
+        for module in modules:
+            importlib.import_module(f".{module}", __package__).add_commands(self)
 
     def command(
         self,
@@ -146,16 +157,24 @@ class Parser(argparse.ArgumentParser):
         rare : sequence of str
             Arguments that only ``--help-all`` shows.
         """
-        assert self.commands is not None
-        parser = self._subparsers._group_actions[0].add_parser(  # type: ignore
+        parser = self.commands[name] = self._adding.add_parser(
             name, help=help, description=f"{help}.", epilog=OVERRIDES if overrides else None
         )
         parser.set_defaults(run=run, takes_overrides=overrides)
         parser.rare = [*rare, *(("progress",) if progress else ())]
+        parser.shows_all = self.shows_all
         if progress:
             both_ways = argparse.BooleanOptionalAction
             parser.add_argument("--progress", action=both_ways, help="Show progress")
         return parser.add_argument
+
+
+def _usage_of(action: argparse.Action) -> str:
+    """Return a required argument as usage shows it."""
+    value = action.metavar or (action.dest.upper() if action.option_strings else action.dest)
+    shown = " ".join([*action.option_strings[:1], str(value)])
+    many = {"+": f"{shown} [{value} ...]", "*": f"[{shown} ...]", "?": f"[{shown}]"}
+    return many.get(str(action.nargs), shown)
 
 
 def add_stage_options(add: Callable, stage: str, *names: str) -> None:

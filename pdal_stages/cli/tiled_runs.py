@@ -18,6 +18,7 @@ from ..base.memory import parse_size
 from ..base.messages import count_of, print_messages
 from ..stages.registry import describe_count
 from ..tiling.options import PER, TilingOptions
+from .parser import Parser
 
 if TYPE_CHECKING:
     from ..tiling.jobs import Job, TiledRun
@@ -34,10 +35,11 @@ def run_files(options: argparse.Namespace) -> list[Output]:
     return [Output(name, what, JSON) for what, name in named.items() if name]
 
 
-def add_tile_options(command: argparse.ArgumentParser, survey: bool = False) -> None:
+def add_tile_options(command: Parser, survey: bool = False) -> None:
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
     when = "Several inputs and large files are cut into tiles" if survey else "Run in tiles"
-    add = command.add_argument_group("large areas", f"{when} (docs/large-areas.md).").add_argument
+    group = command.add_argument_group("large areas", f"{when} (docs/large-areas.md).")
+    add = command.adder_to(group)
     side = "Side of the tiles in the cloud's unit (default: auto)"
     add("--tile", type=_tile_side, metavar="SIZE", help=side)
     add("--memory", metavar="SIZE", help="Most memory to use, e.g. 4GB (default: half of free)")
@@ -73,7 +75,7 @@ def tiling_options(options: argparse.Namespace) -> TilingOptions:
 def requests_tiles(options: argparse.Namespace) -> bool:
     """Return whether ``pipeline`` runs in tiles; refuse other flags of tiles without it."""
     if options.tile is None:
-        add_tile_options(usual := argparse.ArgumentParser())
+        add_tile_options(usual := Parser())
         for name, default in vars(usual.parse_args([])).items():
             if getattr(options, name) != default:
                 raise OptionError(
