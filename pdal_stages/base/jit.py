@@ -3,9 +3,10 @@
 ``njit`` here is numba's with the package's defaults, and numba itself is imported when a kernel is
 first called, so that commands that need none, and errors, come at once. numba keys cached code by
 its own source file only, so a changed *device function* in another module would leave stale code
-behind: the key here is a digest of the sources of the kernel and of all that it calls. Compiled
-code is cached at first use rather than shipped, because it is made for the processor it runs on.
-This file is digested, too: a changed default below, or ``FAST``, compiles everything again.
+behind: here each kernel has a cache folder of its own, named by a digest of the sources of the
+kernel and of all that it calls. Compiled code is cached at first use rather than shipped, because
+it is made for the processor it runs on. This file is digested, too: a changed default below, or
+``FAST``, compiles everything again.
 """
 
 from __future__ import annotations
@@ -13,9 +14,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import pickle
+import shutil
+import tempfile
 import threading
+import time
 from collections.abc import Callable
-from functools import lru_cache, partial, update_wrapper
+from functools import cached_property, lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +55,13 @@ class Kernel:
         """Run the compiled function; a device function runs as it is written."""
         if "no_cpython_wrapper" in self._options:
             return self._function(*arguments)
-        return (self._dispatcher or self.dispatcher)(*arguments)
+        dispatcher = self._dispatcher or self.dispatcher
+        try:
+            return dispatcher(*arguments)
+        except (OSError, EOFError, pickle.UnpicklingError):  # no kernel raises these: the cache
+            if not self._start_over(dispatcher):
+                raise
+        return self(*arguments)
 
     @property
     def dispatcher(self) -> Any:
@@ -58,29 +69,25 @@ class Kernel:
         with _lock:
             if self._dispatcher is None:
                 numba = _numba()
-                self._dispatcher = self._cached(numba) or numba.njit(
-                    **{**self._options, "cache": False}
-                )(self._function)
+                folder = _cache.folder_of(self) if self._options["cache"] else None
+                options = {**self._options, "cache": folder is not None}
+                usual = numba.config.CACHE_DIR
+                numba.config.CACHE_DIR = str(folder or usual)  # read when the cache is made
+                try:
+                    self._dispatcher = numba.njit(**options)(self._function)
+                finally:
+                    numba.config.CACHE_DIR = usual
             return self._dispatcher
 
-    def _cached(self, numba: Any) -> Any:
-        """Return the function with a cache of its code; None if no folder is safe or writable."""
-        try:
-            dispatcher = numba.njit(**self._options)(self._function)
-        except RuntimeError:  # no folder for the cache can be written
-            return None
-        file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-        if hasattr(file, "_source_stamp"):
-            folder = os.path.realpath(file._cache_path)
-            if not Path(folder).is_relative_to(_PACKAGE) and (exposed := exposed_folder(folder)):
-                _tell_uncached(exposed)
-                return None
-            file._cache_path, file._index_path = folder, os.path.join(folder, file._index_name)
-            file._source_stamp = "-".join(sorted(_sources(self)))
-            file.load, file.save = (_careful(file, act) for act in (file.load, file.save))
-            cache = dispatcher._cache
-            cache.load_overload = partial(_load, cache, cache.load_overload)
-        return dispatcher
+    def _start_over(self, failed: Any) -> bool:
+        """Compile again after an error of the cache; False where that was tried before."""
+        with _lock:
+            if self._dispatcher is failed:  # else another thread was here before
+                if not _cache.clear():
+                    return False
+                for kernel in _functions:
+                    kernel._dispatcher = None
+            return True
 
     @property
     def _numba_type_(self) -> Any:
@@ -125,69 +132,74 @@ def _numba() -> Any:
     return numba
 
 
-def _load(cache: Any, usual: Callable, signature: Any, target: Any) -> Any:
-    """Load a kernel without what only compiling needs, a sixth of a small job.
+class _CodeCache:
+    """The folders of compiled code, one for each kernel as its sources are now."""
 
-    numba imports all that it can compile before it loads a kernel. Tried with numba 0.58, 0.61,
-    0.68.
-    """
-    from numba.core.runtime import rtsys
+    #: Seconds after which code that no process loaded is removed: that of older versions.
+    KEPT_S = 90 * 86400
 
-    codegen = target.codegen()
-    try:
-        rtsys.initialize(target)
-        codegen.unserialize_library = partial(_library, codegen)
-        return cache._load_overload(signature, target)
-    except AttributeError:  # numba does not promise these methods: another version lacks one
-        return usual(signature, target)
-    finally:
-        vars(codegen).pop("unserialize_library", None)
+    def __init__(self) -> None:
+        self.failures = 0
+
+    @cached_property
+    def root(self) -> Path | None:
+        """The folder of all code; None where none is safe or can be written."""
+        for root in self.roots():
+            try:
+                root.mkdir(parents=True, exist_ok=True)
+                tempfile.TemporaryFile(dir=root).close()
+            except OSError:
+                continue
+            if not root.is_relative_to(_PACKAGE) and (exposed := exposed_folder(str(root))):
+                print_messages(
+                    f"compiled code is not kept, as other users can write to {exposed}: every "
+                    "start compiles again. Set NUMBA_CACHE_DIR to a folder of your own"
+                )
+                return None
+            for folder in root.iterdir():
+                with contextlib.suppress(OSError):
+                    if time.time() - folder.stat().st_mtime > self.KEPT_S:
+                        shutil.rmtree(folder)
+            return root
+        return None
+
+    @staticmethod
+    def roots() -> list[Path]:
+        """Return the folders that code may be in: the first that can be written is used."""
+        named = os.environ.get("NUMBA_CACHE_DIR")
+        own = os.path.expanduser("~/.cache/pdal-stages")
+        folders = [named] if named else [str(_PACKAGE / "__pycache__"), own]
+        return [Path(os.path.realpath(folder)) / "kernels" for folder in folders]
+
+    def folder_of(self, kernel: Kernel) -> Path | None:
+        """Return the folder of a kernel's code."""
+        if self.failures > 1 or self.root is None:
+            return None
+        folder = self.root / _digest("-".join(sorted(_sources(kernel))).encode())
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            os.utime(folder)
+        return folder
+
+    def clear(self) -> bool:
+        """Remove all code, and at the second time do without; False at the third."""
+        self.failures += 1
+        if self.root:
+            shutil.rmtree(self.root, ignore_errors=True)
+        return self.failures < 3
 
 
-def _library(codegen: Any, state: tuple[str, str, tuple[bytes, bytes]]) -> Any:
-    """Return the library of a kernel's compiled code.
-
-    Its intermediate code, which is larger, is read only when a kernel that calls it is compiled.
-    """
-    from llvmlite.binding import parse_bitcode
-
-    name, _, (code, intermediate) = state
-    library = codegen.create_library(name)
-    library.enable_object_caching()
-    library._set_compiled_object(code)
-    library._finalize_final_module()
-    library._get_module_for_linking = lru_cache(partial(parse_bitcode, intermediate))
-    # numba would read the intermediate code for the names of functions; the compiled code has them.
-    library.get_pointer_to_function = codegen._engine.get_function_address
-    return library
+_cache = _CodeCache()
 
 
-def _careful(file: Any, act: Callable) -> Callable:
-    """Wrap loading or saving of code: after damage or on a full disk it is compiled again."""
-
-    def attempt(*arguments: Any) -> Any:
-        try:
-            return act(*arguments)
-        except Exception:
-            with contextlib.suppress(OSError):
-                file.flush()
-
-    return attempt
-
-
-@lru_cache(maxsize=1)
-def _tell_uncached(folder: str) -> None:
-    """Warn, once in a process, that kernels are compiled at each start, and why."""
-    print_messages(
-        f"compiled code is not kept, as other users can write to {folder}: every start compiles "
-        "again. Set NUMBA_CACHE_DIR to a folder of your own"
-    )
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
 
 
 @lru_cache(maxsize=256)
 def _file_digest(path: str) -> str:
     try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
+        return _digest(Path(path).read_bytes())
     except OSError:
         return path
 
@@ -204,7 +216,7 @@ def _sources(kernel: Any) -> set[str]:
         for name in function.__code__.co_names:
             called = function.__globals__.get(name)
             if isinstance(called, (int, float, tuple)):  # compiled in, from whatever module
-                digests.add(hashlib.sha256(f"{name}={called!r}".encode()).hexdigest()[:16])
+                digests.add(_digest(f"{name}={called!r}".encode()))
             try:
                 if called in _functions and called not in seen:
                     seen.add(called)
@@ -224,8 +236,4 @@ def _tell_compiling(event: Any) -> None:
 
 def count_cached_kernels() -> int:
     """Return how many kernels have compiled code, of whatever version, without importing numba."""
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    folders = [Path(named)] if named else [_PACKAGE, Path.home() / ".cache" / "numba"]
-    # os.walk passes over what may not be entered
-    names = (name for folder in folders for _, _, files in os.walk(folder) for name in files)
-    return sum(name.endswith(".nbi") for name in names)
+    return sum(1 for root in _CodeCache.roots() for _ in root.rglob("*.nbi"))
