@@ -17,6 +17,7 @@ import b16_experiments  # noqa: E402
 import clouds  # noqa: E402
 import h17_oakland  # noqa: E402
 import kit  # noqa: E402
+import maps  # noqa: E402
 import pts_input  # noqa: E402
 import scenes  # noqa: E402
 import w18  # noqa: E402
@@ -135,8 +136,35 @@ def test_w18_run(scene):
     assert runs[2]["classes"] == [0, 5]
     assert runs[1]["oa"] > 60
     text = w18.report(runs)
+    (row,) = [line for line in text.splitlines() if "binary" in line]
+    cells = [cell.strip() for cell in row.strip("|").split("|")][3:]
+    binary = runs[2]
+    both = [f"{binary[key][code]:.2f}" for code in ("5", "0") for key in w18.OF_CLASS]
+    assert cells == [*both, *(f"{binary[key]:.2f}" for key in w18.OF_RUN)]
+    assert "Background recall | Background precision | Background F1 | OA | Kappa" in text
+    assert scenes.name_of("vaihingen", 8) == "Tree"  # not "Model key-point"
     assert "best tenth" in text
     assert "HeightAboveGround" in text
+
+
+def test_the_maps_of_figure_4(folder, capsys, monkeypatch):
+    """[W18 Figure 4]: the multi-class result and one of each target against "Background"."""
+    monkeypatch.setitem(
+        maps.SCENES, "town", ("town/train.pts", "town/test.pts", {"1": 3, "2": 11, "5": 6, "8": 5})
+    )
+    monkeypatch.setitem(maps.TARGETS, "town", ((5,), (8,)))
+    quick = {
+        "neighborhoods": "c2,s2",
+        "feature_set": "covariance,geometric",
+        "count": 200,
+        "trees": 10,
+    }
+    picture = maps.figure_4(folder, "town", quick)
+    printed = capsys.readouterr().out
+    assert printed.count("(Background ") == 2 and "kappa" in printed and "Building" in printed
+    half = picture.shape[0] // 2, picture.shape[1] // 2
+    colors = [picture[: half[0], half[1] :], picture[half[0] :, : half[1]]]
+    assert not np.array_equal(*colors) and len(picture) > 100
 
 
 def test_h17_thresholds_are_a_choice_between_two_tables(town):

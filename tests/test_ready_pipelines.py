@@ -9,7 +9,8 @@ import laspy
 import numpy as np
 import pytest
 
-from pdal_stages import run_tiled
+from pdal_stages import load_model, run_tiled
+from pdal_stages.classifier.training_options import RECIPES
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.pipeline.run import Pipeline
@@ -78,6 +79,33 @@ def test_tile_index_to_tiles(ready_halves, ready_models, tmp_path):
     overrides = parse_overrides(options)[0]
     run_tiled(FOLDER / "tile-index-to-tiles.json", 500, overrides, per="tile", workers=0)
     assert list(tmp_path.glob("o_*.laz"))
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("paper-*.json")), ids=lambda path: path.stem)
+def test_papers(ready_town, tmp_path, path):
+    """Each trains as its recipe says, with fewer samples and trees, and the model classifies."""
+    recipe, more = path.stem.removeprefix("paper-"), {"model.count": 60, "model.folds": 0}
+    if recipe == "winiwarter2019":
+        pytest.importorskip("torch", reason="PyTorch is not installed (extra 'deep')")
+        more |= {"model.alsnet": '{"configuration": "tiny", "epochs": 1}'}
+    elif recipe == "blomley2016":
+        more |= {"model.trees_grid": "3,4"}
+    else:
+        more |= {"model.trees": 4}
+    run(path.stem, ready_town, more=more | {"model.filename": tmp_path / "a.model"})
+    model = load_model(tmp_path / "a.model")
+    names = dict(model.classes)
+    if recipe.endswith("binary"):
+        assert names == {1: "Background", 6: "Building"}
+    else:
+        assert {2, 5, 6} <= names.keys()
+    options = RECIPES[recipe]
+    if "alsnet" in options:
+        assert model.info["training"]["network"]["augment"] is False
+        assert model.info["training"]["network"]["learning_rate"] == 0.001
+    else:
+        assert model.info["training"]["vote"] == options.get("vote", "mean")
+        assert len(model.passes) == 1
 
 
 def test_evaluate(ready_town, ready_models, tmp_path):

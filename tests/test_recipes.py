@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier.class_map import ClassMap
 from pdal_stages.classifier.random_forest import grow_forest
 from pdal_stages.classifier.sampling import draw_samples
 from pdal_stages.classifier.train_forest import limit_to_percentiles
@@ -25,7 +27,7 @@ from pdal_stages.stages.registry import stage_from, stage_types
 from pdal_stages.tiling.train_survey import TrainTask
 
 #: Features of a recipe, by the texts: [B16 3.1, 3.2.1], [W18 3.1, 3.2], [H17 2.2].
-FEATURES = {"blomley2016": 312, "weinmann2018": 560, "he2017": 6}
+FEATURES = {"blomley2016": 312, "weinmann2018": 560, "weinmann2018-binary": 560, "he2017": 6}
 
 HEIGHT = "HeightAboveGround"
 
@@ -88,7 +90,7 @@ def test_what_is_given_beside_a_recipe_replaces_its_value(name):
     stage = stage_from({**known, "voxel": 0.5, "count": 77})
     assert (stage.voxel, stage.count) == (0.5, 77)
     for option, value in RECIPES[name].items():
-        if option not in ("voxel", "alsnet"):
+        if option not in ("voxel", "alsnet", "classes"):
             result = stage.options[option]
             assert result == (77 if option == "count" else _plain(value)), option
     assert f"  {name}\n" in describe_recipes()
@@ -98,9 +100,36 @@ def _plain(value):
     return list(value) if isinstance(value, tuple) else value
 
 
-def test_an_unknown_recipe_is_refused():
-    with pytest.raises(OptionError, match="'recipe' must be one of"):
-        with_recipe({"recipe": "weinman2018"})
+@pytest.mark.parametrize("name", ["weinman2018", "weinmann2018,vaihing", ["vaihing"], 5])
+def test_an_unknown_recipe_is_refused(name):
+    with pytest.raises(OptionError, match="'recipe' must be"):
+        with_recipe({"recipe": name})
+
+
+def test_labels_of_vaihingen_are_classes_with_its_names():
+    """Codes 0, 1 and 7 say nothing in LAS; there they are power lines, low vegetation, shrubs."""
+    known = {"type": "writers.classifiermodel", "filename": "a.model"}
+    stage = stage_from({**known, "recipe": "weinmann2018-binary,vaihingen", "target": 5})
+    assert (stage.count, stage.target) == (100_000, 5)
+    classes = ClassMap.parse(stage.training.classes)
+    names = dict(zip(classes.labels, classes.names, strict=True))
+    assert names[(8,)] == "Tree" and names[(7,)] == "Shrub" and names[(0,)] == "Powerline"
+    rng = np.random.default_rng(3)
+    xyz, labels = rng.uniform(0, 30, (4000, 3)), rng.integers(0, 9, 4000)
+    xyz[:, 2] = labels
+    options = replace(
+        stage.training, neighborhoods="c2", feature_set="HeightRange", dimensions=("Z",), count=50,
+        trees=10, folds=0,
+    )  # fmt: skip
+    model = train([TrainingCloud(xyz, labels)], options, progress=False)
+    assert dict(model.classes) == {1: "Background", 5: "Tree"}
+    nine = train([TrainingCloud(xyz, labels)], replace(options, target=None), progress=False)
+    assert dict(nine.classes)[4] == "Shrub" and len(nine.classes) == 9
+    predicted = nine.predict(xyz, {}).classification
+    assert all(
+        (predicted[labels == label] == code).mean() > 0.9
+        for label, code in ((0, 14), (1, 3), (7, 4))
+    )
 
 
 def test_the_threshold_of_copt_is_given_or_found():

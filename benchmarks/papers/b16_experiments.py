@@ -21,7 +21,6 @@ from kit import Cache, Results, draw, figures, finish, limits, note, parser, pre
 from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.base.asprs import class_name
 from pdal_stages.classifier.training_options import RECIPES
 from pdal_stages.features.registry import GROUPS
 
@@ -115,7 +114,7 @@ def report(runs: list[dict[str, Any]]) -> str:
                     ]
                     for hood in NEIGHBORHOODS
                 ]
-                words = f"{class_name(int(code))}: {key} [%]\n\n"
+                words = f"{scenes.name_of(name, code)}: {key} [%]\n\n"
                 text.append(words + table(("Neighborhood", *SETS), rows))
         chosen = [run["trees"] for run in here]
         text.append(

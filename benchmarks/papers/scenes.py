@@ -11,10 +11,19 @@ from clouds import Cloud, read_cloud, with_height
 from kit import Cache, features, fingerprint, fitted_bins, note
 from pts_input import COLUMNS, read_pts
 
+from pdal_stages.base.asprs import class_name
+from pdal_stages.classifier.training_options import RECIPES
 from pdal_stages.features import FeaturePlan
 
 #: Scene -> classes trained and scored; points of other classes are neighbors only.
 SCENES = {"montpellier": (2, 3, 4, 5, 6), "delft": (1, 2, 6)}
+#: Scene -> names of labels that are not codes of ASPRS.
+NAMES = {
+    "vaihingen": {
+        int(label): str(name).partition(" ")[2]
+        for label, name in RECIPES["vaihingen"]["classes"].items()
+    }
+}
 NEIGHBORHOODS = "weinmann2018"  # [B16]'s are among them
 
 
@@ -48,6 +57,11 @@ class Columns:
 
     def __getitem__(self, rows: slice) -> np.ndarray:
         return self.table[rows][:, self.columns]
+
+
+def name_of(scene: str, label: int | str) -> str:
+    """Return the name of a label of a scene."""
+    return NAMES.get(scene.partition(",")[0], {}).get(int(label)) or class_name(int(label))
 
 
 def read_scene(data: Path, scene: str, part: str, columns: str | None = None) -> Cloud:

@@ -24,7 +24,6 @@ from kit import Cache, Results, draw, figures, finish, grow_forest, limits, note
 from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
-from pdal_stages.base.asprs import class_name
 from pdal_stages.features.registry import GROUPS
 
 EXPERIMENT = 3  # raised when runs mean something else than before, so that none is resumed
@@ -136,14 +135,27 @@ def report(runs: list[dict[str, Any]]) -> str:
                 [f"{what[0]}, {what[1]:,}", *(spread(values(chosen, "f1", code)) for code in codes)]
             )
         text.append(
-            "F1 by class\n\n" + table(("", *(class_name(int(code)) for code in codes)), rows)
+            "F1 by class\n\n" + table(("", *(scenes.name_of(name, code) for code in codes)), rows)
         )
         text.append(_binary(here))
         text.append(_carriers(here))
     return "\n".join(text)
 
 
+#: Measures of a class, and of a whole run, in the tables of binary experiments.
+OF_CLASS, OF_RUN = ("recall", "precision", "f1"), ("oa", "kappa", "mf1")
+
+
+def against_others(run: dict[str, Any], codes: list[int]) -> dict[str, Any]:
+    """Return the figures of a run where the codes are class 1, and all others class 0."""
+    counts, target = np.asarray(run["matrix"]), np.isin(run["classes"], codes)
+    sides = (~target, target)
+    parts = [[int(counts[np.ix_(true, found)].sum()) for found in sides] for true in sides]
+    return figures(Accuracy.from_confusion(parts, (0, 1)))
+
+
 def _binary(runs: list[dict[str, Any]]) -> str:
+    """Return a table of binary runs as [W18 Table 2], beside the same class of multi-class runs."""
     rows = []
     for target, count in dict.fromkeys(
         (r["target"], r["count"]) for r in runs if r["target"] is not None
@@ -151,19 +163,20 @@ def _binary(runs: list[dict[str, Any]]) -> str:
         ours = choose(runs, target=target, count=count)
         multi = choose(runs, target=None, kind="all", count=count)
         codes = [int(code) for code in target.split("+")]
-        label = " and ".join(class_name(code) for code in codes)
+        scene = runs[0]["scene"]
+        label = " and ".join(scenes.name_of(scene, code) for code in codes)
         for words, chosen in (("binary", ours), ("multi-class", multi)):
-            if words == "multi-class" and len(codes) > 1:
-                continue  # the multi-class runs have no such class
-            cells = [
-                spread(values(chosen, key, str(codes[0]))) for key in ("recall", "precision", "f1")
+            both = [
+                against_others(run, codes[:1] if words == "binary" else codes) for run in chosen
             ]
+            cells = [
+                spread(values(both, key, str(code))) for code in (1, 0) for key in OF_CLASS
+            ] + [spread(values(both, key)) for key in OF_RUN]
             rows.append([f"{label}, {words}", f"{count:,}", str(len(chosen)), *cells])
-    return (
-        table(("Target", "Samples per class", "Seeds", "Recall", "Precision", "F1"), rows)
-        if rows
-        else ""
-    )
+    each = ("recall", "precision", "F1")
+    head = (*map(str.capitalize, each), *(f"Background {word}" for word in each))
+    head = ("Target", "Samples per class", "Seeds", *head, "OA", "Kappa", "Mean F1")
+    return table(head, rows) if rows else ""
 
 
 def _carriers(runs: list[dict[str, Any]]) -> str:

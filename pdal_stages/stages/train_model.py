@@ -54,11 +54,11 @@ class TrainModel(Stage, settings=TrainingOptions):
     needs_points = "train on"
     filename: str = option("filename", None, "The model file to write", required=True)
     label: str = option("string", "Classification", "Dimension that holds the labels")
-    recipe: str | None = option(
-        "string",
+    recipe: list | None = option(
+        "list",
         None,
-        "Set the options as a paper does; options given beside it replace the paper's",
-        choices=tuple(RECIPES),
+        f"Set the options as a paper does ({', '.join(RECIPES)}); of several the last one counts; "
+        "options given beside them replace theirs",
     )
     base: str | None
     seed: int
