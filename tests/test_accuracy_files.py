@@ -51,6 +51,32 @@ def test_references_of_other_points_are_refused(moved, refused):
         _refuse_other_points(one, other, "a.las", "b.las")
 
 
+@pytest.mark.parametrize(
+    ("code", "moved", "refused"),
+    [(4326, 1e-6, True), (4326, 5e-8, False), (2992, 0.02, False), (2992, 0.05, True)],
+)
+def test_the_same_place_is_a_centimeter_in_any_unit(code, moved, refused):
+    """0.000001 degrees are 11 cm; 2992 is in feet."""
+    wkt = pytest.importorskip("pyproj").CRS.from_epsg(code).to_wkt("WKT1_GDAL")
+    x, zero = np.arange(3.0), np.zeros(3)
+    one, other = (Points({"X": x + d, "Y": zero, "Z": zero}, wkt=wkt) for d in (0.0, moved))
+    with pytest.raises(StageError, match="lie apart") if refused else nullcontext():
+        _refuse_other_points(one, other, "a.las", "b.las")
+
+
+@pytest.mark.pdal
+def test_points_of_files_in_degrees_that_lie_apart_are_refused(tmp_path, run, write_las):
+    x, y = 5.0 + np.arange(100) * 1e-5, 52.0 + np.zeros(100)
+    arrays = {"Z": 0 * x, "Classification": np.full(100, 2, np.uint8), "Y": y}
+    names = [
+        str(write_las(tmp_path / name, {"X": x + d, **arrays}, scale=1e-7, point_format=6))
+        for name, d in (("a.las", 0.0), ("b.las", 0.005))
+    ]
+    code, _, err = run("accuracy", names[0], "--reference", names[1])
+    assert code == 1 and "100 points of" in err and "lie apart" in err
+    assert run("accuracy", names[0], "--reference", names[0])[0] == 0
+
+
 def test_files_are_paired_by_name():
     files, true = ["out/c_t1.laz", "out/c_t11.laz"], ["truth/t11.laz", "truth/t1.laz"]
     assert sorted(paired(files, true)) == sorted(zip(files, true[::-1], strict=True))

@@ -48,10 +48,10 @@ def test_partners_are_the_points_themselves(seed, n, places):
     xyz = random.integers(0, places, (n, 3)) * 0.01 + 500_000.0
     time = random.permutation(n).astype(float)
     order = random.permutation(n)
-    matches = match_points(xyz, xyz[order], 0.01, [(time, time[order])])
+    matches = match_points(xyz, xyz[order], np.full(3, 0.01), [(time, time[order])])
     assert np.array_equal(order[matches], np.arange(n))
     # Without anything that tells them apart: points of the same place, each taken once.
-    matches = match_points(xyz, xyz[order], 0.01)
+    matches = match_points(xyz, xyz[order], np.full(3, 0.01))
     assert sorted(matches) == list(range(n))
     assert np.abs(xyz[order][matches] - xyz).max() < 1e-6
 
@@ -59,9 +59,30 @@ def test_partners_are_the_points_themselves(seed, n, places):
 def test_points_left_over_take_the_nearest():
     before = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
     after = np.array([[2.004, 0, 0], [0.0, 0, 0], [1.006, 0, 0]])
-    assert match_points(before, after, 0.001, max_distance=0.01).tolist() == [1, 2, 0, -1]
-    assert match_points(before, after, 0.001, max_distance=0.005).tolist() == [1, -1, 0, -1]
-    assert match_points(before, after, 0.001).tolist() == [1, -1, -1, -1]
+    steps = np.full(3, 0.001)
+    assert match_points(before, after, steps, max_steps=10).tolist() == [1, 2, 0, -1]
+    assert match_points(before, after, steps, max_steps=5).tolist() == [1, -1, 0, -1]
+    assert match_points(before, after, steps).tolist() == [1, -1, -1, -1]
+
+
+@pytest.mark.parametrize("scales", [(0.001, 0.001, 1.0), (1e-3, 1e-2, 1e-4), (0.5, 0.001, 0.001)])
+def test_each_axis_has_its_own_scale(tmp_path, run, scales):
+    rng = np.random.default_rng(0)
+    cloud = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+    cloud.header.scales = scales
+    cloud.x, cloud.y, cloud.z = rng.uniform(0, 30, (3, 3000))
+    cloud.classification[:] = 2
+    cloud.write(tmp_path / "before.las")
+    edited = rng.choice(3000, 300, replace=False)
+    cloud.classification[edited] = 6
+    order = rng.permutation(3000)
+    cloud.points = cloud.points[order]
+    cloud.write(tmp_path / "after.las")
+    names = [str(tmp_path / name) for name in ("before.las", "after.las")]
+    code, out, _err = run("corrections", *names, "--out", str(tmp_path / "o.las"), "--around", "0")
+    assert code == 0 and "300 changed" in out
+    result = laspy.read(tmp_path / "o.las")
+    assert np.array_equal(np.flatnonzero(result["Checked"]), np.sort(edited))
 
 
 @pytest.mark.parametrize("how", [{}, {"drop": 30}, {"scale": 0.01}])

@@ -186,3 +186,27 @@ def test_files_without_points(tmp_path, run, write_las):
     with sqlite3.connect(tmp_path / "r.gpkg") as base:
         for name in ("patches", "tiles"):
             assert base.execute(f"select count(*) from {name}").fetchone() == (0,)
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize(
+    ("values", "kind", "shown"),
+    [
+        (80.0, "f4", "80 to 80"),
+        (255, "u1", "255 to 255"),
+        (np.inf, "f4", "inf"),
+        (-0.1, "f8", "-0.1"),
+    ],
+)
+@pytest.mark.parametrize("command", ["review", "objects", "accuracy"])
+def test_a_reliability_beyond_0_to_1_is_refused(
+    tmp_path, run, write_las, command, values, kind, shown
+):
+    x, y = (v.ravel() * 0.5 for v in np.meshgrid(np.arange(60.0), np.arange(60.0)))
+    arrays = {"X": x, "Y": y, "Z": 0 * x, "Classification": np.full(len(x), 2, np.uint8)}
+    arrays["Reliability"] = np.full(len(x), values, kind)
+    source = str(write_las(tmp_path / "a.laz", arrays, point_format=6))
+    words = ["--reference", source] if command == "accuracy" else [str(tmp_path / "o.gpkg")]
+    code, _, err = run(command, source, *words)
+    assert code == 1 and "'Reliability' must be the probability" in err and shown in err
+    assert not (tmp_path / "o.gpkg").exists()

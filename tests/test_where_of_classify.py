@@ -132,3 +132,25 @@ def test_what_newer_pdal_reads_of_class_12(of_old_format, kept):
     metadata = {"readers.las": {"dataformat_id": 1 if of_old_format else 6}}
     points = Points(arrays, overlap_as_flag=overlap_as_flag(arrays, metadata))
     assert points.chosen(Wires({}).keep).tolist() == kept
+
+
+@pytest.mark.parametrize("door", ["classify", "pipeline"])
+@pytest.mark.parametrize(
+    "name",
+    ["X", "z", "Intensity", "CLASSIFICATION", "Reliability", "heightaboveground", "mine", "MINE"],
+)
+def test_a_mark_is_no_dimension_that_is_there(tmp_path, run, run_job, write_las, name, door):
+    """In any case of letters, of LAS, of the stages, or of the file."""
+    xyz = np.random.default_rng(0).uniform(0, 30, (3000, 3)) * [1, 1, 0.01]
+    source = write(write_las, tmp_path / "in.las", xyz, 6, mine=np.arange(3000.0))
+    out = tmp_path / "out.las"
+    if door == "classify":
+        option = f"--filters.modelclassifier.mark={name}"
+        code, _, err = run("classify", source, out, "--where", "Z > 0", option)
+    else:
+        classifier = {"type": "filters.modelclassifier", "model": "standard", "mark": name}
+        heights = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
+        reader = {"type": "readers.las", "filename": str(source), "use_eb_vlr": True}
+        code, _, err = run_job([reader, heights, classifier, out])
+    assert code == 1 and "'mark' must name a new dimension" in err
+    assert not out.exists()

@@ -4,7 +4,8 @@ They are written in a hidden folder beside their final place, then renamed. The 
 name, is private to its owner and locked while its writer runs, so what a killed writer left is
 recognized and removed by the next one.
 
-* An existing file is replaced; the new one keeps its mode, and its owner where permitted.
+* An existing file is replaced; the new one keeps its mode, and its owner where permitted. What
+  other programs left beside it (:mod:`.companions`) is removed.
 * A link is followed: its target is replaced, the link stays.
 * A device, pipe or terminal (``/dev/stdout``) gets the content once it is complete.
 * A write-protected file, a file of another kind, a folder, a socket and a block device are refused.
@@ -26,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+from .companions import is_open_database, remove_companions
 from .errors import StageError
 
 LAS = "a LAS or LAZ file"
@@ -79,7 +81,8 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     ------
     StageError
         If its folder is missing or read-only, its name is too long, or what exists there must not
-        be replaced: a folder, a write-protected file, a file of another kind.
+        be replaced: a folder, a write-protected file, a file of another kind, a database that
+        another program has open.
     """
 
     def refuse(problem: str, cure: str | None = None, value: str = str(path)) -> NoReturn:
@@ -104,6 +107,8 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
         refuse("the folder of the {} file cannot be written to", value=str(real.parent))
     if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
         refuse("the {} file is write-protected", "Give another name, or change its mode")
+    if is_open_database(real):
+        refuse("the {} file is open in another program", "Close it there, or give another name")
     older = kind_of(real) if kind else ""
     if older and older != kind:
         cure = "Give another name, or remove that file first"
@@ -312,6 +317,7 @@ def whole_files(
             check_writable(target, what, kind_of(partial) or _OTHER)
             if check is not None:
                 check(partial, target, number)
+        remove_companions(target for _, target, _ in moves if not is_stream(target))
         for partial, target, _ in moves:
             _give_name(partial, target)
     except StageError as error:

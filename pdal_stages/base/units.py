@@ -162,15 +162,36 @@ def units_of_wkt(
     return Units(across, across if upward is None else upward, assumed)
 
 
+#: Of latitude on the average, and of longitude at the equator.
+METERS_PER_DEGREE = 111_320.0
+
+
+def is_geographic(wkt: str) -> bool:
+    """Return whether x and y of a spatial reference (WKT) are degrees."""
+    root = parse_wkt(wkt) if wkt.strip() else None
+    if root is None or root.find("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS"):
+        return False
+    geodetic = root.find(*_GEODETIC)
+    return geodetic is not None and not _is_geocentric(geodetic)
+
+
+#: Keywords of references on the globe. WKT 2 has one for degrees and for geocentric coordinates.
+_GEODETIC = ("GEOCCS", "GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS")
+
+
+def _is_geocentric(geodetic: WktNode) -> bool:
+    """Return whether coordinates on the globe are meters from the earth's center."""
+    system = geodetic.find("CS")
+    cartesian = system is not None and system.name.lower() == "cartesian"
+    return geodetic.keyword == "GEOCCS" or cartesian
+
+
 def _refuse_globe(root: WktNode, wkt: str, place: tuple[float, float] | None) -> None:
     """Refuse a reference without a projected plane: degrees, or meters from the earth's center."""
-    geodetic = root.find("GEOCCS", "GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS")
+    geodetic = root.find(*_GEODETIC)
     if geodetic is None:
         return
-    system = geodetic.find("CS")  # WKT 2 has one keyword for both
-    centered = geodetic.keyword == "GEOCCS" or (
-        system is not None and system.name.lower() == "cartesian"
-    )
+    centered = _is_geocentric(geodetic)
     code = f"EPSG:{(place and not centered and utm_code(*place)) or 'CODE'}"
     raise StageError(
         "the coordinates are geocentric (from the earth's center); heights need a vertical axis"

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, StageError, suggest
 from ..base.files import check_outputs
+from ..base.las import header_there
 from ..base.messages import Report
 from ..base.progress import Progress
+from ..base.units import METERS_PER_DEGREE, is_geographic
 from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from ..stages.registry import stage_from
@@ -75,9 +77,9 @@ def compare_files(
     return report.messages
 
 
-#: Points of two files that are farther apart along an axis, in its unit, are not the same: formats
+#: Points of two files that are farther apart along an axis, in meters, are not the same: formats
 #: round coordinates to as much.
-_FAR_APART = 0.01
+_FAR_APART_M = 0.01
 
 #: Points of a file, their judged and their true classes (n,).
 Judged = tuple[Points, NDArray[np.uint8], NDArray[np.uint8]]
@@ -130,12 +132,30 @@ def _codes(points: Points, name: str, source: str) -> NDArray[np.uint8]:
     return points.codes_of(name)
 
 
+def _tolerances(points: Points, *files: str) -> list[float]:
+    """Return how far apart the same point may lie in two files, for each axis in its unit.
+
+    It is one step of the coarser coordinates where both are LAS files, else `_FAR_APART_M`.
+    """
+    headers = [header_there(file) for file in files]
+    steps = [header.scales for header in headers if header is not None]
+    if len(steps) == len(files):
+        return [max(scales) for scales in zip(*steps, strict=True)]
+    try:
+        across, upward = points.units.horizontal, points.units.vertical
+    except StageError:  # degrees, or meters from the earth's center
+        geocentric = points.wkt and not is_geographic(points.wkt)
+        across, upward = 1.0 if geocentric else METERS_PER_DEGREE, 1.0
+    return [_FAR_APART_M / unit for unit in (across, across, upward)]
+
+
 def _refuse_other_points(judged: Points, true: Points, source: str, reference: str) -> None:
     """Refuse a reference that holds other points, or the same in another order."""
     difference = f"{judged.count:,} points in {source}, {true.count:,} in {reference}"
     if judged.count == true.count:
-        axes = [axis for axis in ("X", "Y", "Z") if axis in judged.arrays and axis in true.arrays]
-        away = [np.abs(judged.arrays[axis] - true.arrays[axis]) > _FAR_APART for axis in axes]
+        limits = dict(zip("XYZ", _tolerances(judged, source, reference), strict=True))
+        axes = [axis for axis in limits if axis in judged.arrays and axis in true.arrays]
+        away = [np.abs(judged.arrays[axis] - true.arrays[axis]) > limits[axis] for axis in axes]
         number = max(map(np.count_nonzero, away), default=0)
         if not number:
             return

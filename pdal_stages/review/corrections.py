@@ -24,7 +24,8 @@ from ..pipeline.spatial_reference import reference_of_file
 #: Share of points without a partner beyond which two files hold different points: large enough for
 #: points that a person deleted, small enough to notice another file; not tuned.
 MAX_LOST_SHARE = 0.1
-#: Farthest that editing moves a point, in steps of the coarser coordinates, which round; not tuned.
+#: Farthest that editing moves a point, in steps of each axis' coarser scale, which rounds; not
+#: tuned.
 MAX_STEPS = 3.0
 #: Layer of a review that holds patches.
 PATCHES = "patches"
@@ -159,11 +160,11 @@ def _edited_codes(
     """Return the classes of the same points in another file; their former ones where missing."""
     other = _read(after)
     theirs = np.column_stack([other.x, other.y, other.z])
-    step = float(max(*las.header.scales, *other.header.scales))
+    steps = np.maximum(las.header.scales, other.header.scales)
     both = {*las.point_format.dimension_names} & {*other.point_format.dimension_names}
     names = [name for name in _DISTINGUISHING if name in both]
     pairs = [(np.asarray(las[name]), np.asarray(other[name])) for name in names]
-    index = match_points(xyz, theirs, step, pairs, max_distance=MAX_STEPS * step)
+    index = match_points(xyz, theirs, steps, pairs, max_steps=MAX_STEPS)
     lost, extra = int((index < 0).sum()), len(theirs) - int((index >= 0).sum())
     if max(lost, extra) > MAX_LOST_SHARE * len(xyz):
         raise StageError(
@@ -218,9 +219,9 @@ def _in_area(
 def match_points(
     before: NDArray[np.float64],
     after: NDArray[np.float64],
-    step: float,
+    steps: NDArray[np.float64],
     pairs: Sequence[tuple[NDArray, NDArray]] = (),
-    max_distance: float = 0.0,
+    max_steps: float = 0.0,
 ) -> NDArray[np.int64]:
     """Return the index in `after` of each point of `before`, -1 for none; each is used once.
 
@@ -228,19 +229,20 @@ def match_points(
     ----------
     before, after : (n, 3), (m, 3) float64
         Coordinates.
-    step : float
-        The coarser of both files' steps of coordinates.
+    steps : (3,) float64
+        The coarser of both files' steps of coordinates, of each axis.
     pairs : sequence of pairs of (n,) and (m,) arrays
         Values that distinguish points at the same coordinates; where they differ between the
         files, only the pairing changes.
-    max_distance : float
-        Points without a partner at their coordinates take the nearest unused one within it.
+    max_steps : float
+        Points without a partner at their coordinates take the nearest unused one within so many
+        steps.
     """
     out, n, m = np.full(len(before), -1, np.int64), len(before), len(after)
     if not n or not m:
         return out
     low = np.minimum(before.min(axis=0), after.min(axis=0))
-    cells = np.rint((np.concatenate([before, after]) - low) / step).astype(np.int64)
+    cells = np.rint((np.concatenate([before, after]) - low) / steps).astype(np.int64)
     _, place = np.unique(cells, axis=0, return_inverse=True)
     orders, keys = [], []
     for side, places in enumerate(np.split(place.reshape(-1), [n])):
@@ -254,9 +256,9 @@ def match_points(
     unused = np.ones(m, bool)
     unused[out[out >= 0]] = False
     lost, free = np.flatnonzero(out < 0), np.flatnonzero(unused)
-    if max_distance > 0 and len(lost) and len(free):
-        tree = scipy.spatial.cKDTree(after[free])
-        distance, near = tree.query(before[lost], distance_upper_bound=max_distance)
+    if max_steps > 0 and len(lost) and len(free):
+        tree = scipy.spatial.cKDTree((after[free] - low) / steps)
+        distance, near = tree.query((before[lost] - low) / steps, distance_upper_bound=max_steps)
         good = np.flatnonzero(np.isfinite(distance))
         good = good[np.argsort(distance[good], kind="stable")]
         _, first = np.unique(near[good], return_index=True)  # of several the nearest

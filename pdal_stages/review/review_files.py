@@ -201,6 +201,11 @@ def read_points(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
         kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)
         existing = [name for name in DIMENSIONS if name in arrays]
         columns = {name: np.asarray(points.dimension(name))[kept] for name in existing}
+        try:
+            if points.reliability is not None:
+                columns["Reliability"] = points.reliability[kept]
+        except StageError as error:
+            raise error.at(path) from None
         yield {"xyz": points.xyz[kept], "codes": codes[kept], **columns}
 
 

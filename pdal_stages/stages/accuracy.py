@@ -159,9 +159,7 @@ class AccuracyStage(Stage):
         """Return the classes of both sides, of the points that are compared."""
         chosen = Selection.parse(["withheld"], "ignore") if self.ignore is None else self.ignore
         inside = points.usable(replace(chosen, codes=()))  # codes are of the reference
-        reliability = None
-        if "Reliability" in points.arrays:
-            reliability = np.asarray(points.arrays["Reliability"])[inside]
+        reliability = None if points.reliability is None else points.reliability[inside]
         reference, predicted = (
             points.codes_of(n)[inside] for n in (self.reference, self.dimension)
         )

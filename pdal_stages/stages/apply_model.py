@@ -27,7 +27,7 @@ from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
 from ..terrain.smrf import FilterOptions
 from .base import Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
-from .points import Points, class_counts
+from .points import LAS_DIMENSIONS, Points, class_counts
 from .preprocessing import as_json, same, with_given_ground
 
 #: Dimension of the height above ground.
@@ -114,6 +114,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
         self.limits  # noqa: B018  refused here where nothing is known of the model
         if self.mark and not re.fullmatch(r"[A-Za-z]\w*", self.mark):
             raise OptionError("option 'mark' must be a name of letters and digits", found=self.mark)
+        taken = {name.lower() for name in (*LAS_DIMENSIONS, HEIGHT, *self._created)}
+        if self.mark.lower() in taken:
+            raise self._mark_exists(self.mark)
         codes = [code for code, _ in self.model.classes]
         if self.variance and not self.model.gives_variance:
             raise OptionError(
@@ -181,13 +184,22 @@ class ApplyModel(Stage, settings=PredictionOptions):
             names.append(HEIGHT)
         return list(dict.fromkeys(names))
 
+    def _mark_exists(self, name: str) -> OptionError:
+        """Return the error on a `mark` that is another dimension's name, whatever its case."""
+        what = "option 'mark' must name a new dimension"
+        return OptionError(what, found=name, cure="Take a name that no dimension has")
+
     def creates(self) -> dict[str, str]:
         """Return the dimensions that are written, with their PDAL types."""
+        return self._created | ({self.mark: "uint8_t"} if self.mark else {})
+
+    @property
+    def _created(self) -> dict[str, str]:
+        """Return the dimensions that are written, without `mark`."""
         more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
         if self.probabilities:
             more += [f"Probability_{code}" for code, _ in self.model.classes]
-        created = {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
-        return created | ({self.mark: "uint8_t"} if self.mark else {})
+        return {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
@@ -213,6 +225,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Classify the points."""
+        same = [name for name in points.arrays if name.lower() == self.mark.lower()]
+        if self.mark and (len(same) > 1 or any(points.arrays[name].any() for name in same)):
+            raise self._mark_exists(", ".join(same))
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
         current = points.class_codes

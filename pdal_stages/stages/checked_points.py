@@ -53,9 +53,8 @@ def select_checked(
     points.report.figures["checked"] = wanted
     text = f"{wanted:,} of {points.count:,} points were checked by a person ({CHECKED}): samples "
     text += "are drawn from these"
-    if base_codes and "Reliability" in points.arrays:
-        reliability = np.asarray(points.arrays["Reliability"])
-        sure = points.inside & ~checked & (reliability >= SURE)
+    if base_codes and points.reliability is not None:
+        sure = points.inside & ~checked & (points.reliability >= SURE)
         counts = np.bincount(codes[chosen], minlength=256)[base_codes]
         beside = 0
         for code in np.asarray(base_codes)[counts > 0]:

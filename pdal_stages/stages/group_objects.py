@@ -95,7 +95,7 @@ class ObjectOptions:
         """Return cells with a part of a cloud's points, whatever classes it has."""
         usable = points.usable(self.ignore)
         x, y, z = points.axes
-        codes, reliability = points.class_codes, points.arrays.get("Reliability")
+        codes, reliability = points.class_codes, points.reliability
         if not usable.all():
             x, y, z, codes = x[usable], y[usable], z[usable], codes[usable]
             reliability = None if reliability is None else reliability[usable]

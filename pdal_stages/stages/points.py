@@ -37,8 +37,17 @@ NO_POLYGON_NEAR = "no polygon lies where the points are (check the reference sys
 SELECTED = "PdalStagesSelected"
 #: Steps to which coordinates are rounded; scales of LAS files are whole numbers of them, as a rule.
 _STEPS_PER_UNIT = 1e6
+#: Dimensions that points of LAS files have.
+LAS_DIMENSIONS = (
+    *("X", "Y", "Z", "Intensity", "ReturnNumber", "NumberOfReturns", "ScanDirectionFlag"),
+    *("EdgeOfFlightLine", "Classification", "ClassFlags", "Synthetic", "KeyPoint", "Withheld"),
+    *("Overlap", "ScanAngleRank", "ScanChannel", "UserData", "PointSourceId", "GpsTime"),
+    *("Red", "Green", "Blue", "Infrared"),
+)
 #: Flags of a point, in the order of their bits.
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
+#: How far rounding may take a share beyond 0 or 1.
+_SHARE_ROUNDING = 1e-5
 #: Prefix of dimensions that are lengths upward, as Z is, and have its unit.
 _HEIGHTS = "HeightAbove"
 
@@ -209,6 +218,32 @@ class Points:
                 found=str(values[wrong][0]),
             )
         return codes & np.uint8(LEGACY_LIMIT) if self.legacy_flags else codes
+
+    @cached_property
+    def reliability(self) -> NDArray[np.float32] | None:
+        """Return `Reliability` (n,), 0 where it is NaN; None where the points have none.
+
+        Raises
+        ------
+        DimensionError
+            For values that are no share of 1, such as per cent.
+        """
+        if "Reliability" not in self.arrays:
+            return None
+        values = np.asarray(self.arrays["Reliability"])
+        known = np.where(np.isnan(values), 0, values)
+        # Averages of shares may leave 0 to 1 by rounding.
+        beyond = (known < -_SHARE_ROUNDING) | (known > 1 + _SHARE_ROUNDING)
+        if beyond.any():
+            count = f"{np.count_nonzero(beyond):,} of {self.count:,} points"
+            raise DimensionError(
+                "'Reliability' must be the probability of a point's class, 0 to 1",
+                found=f"{known.min():g} to {known.max():g}; {count} lie beyond",
+                cure="Scale it, or leave it out: pdal-stages review computes one where there is "
+                "none. Of per cent: pdal translate IN OUT assign "
+                "--filters.assign.value='Reliability = Reliability / 100'",
+            )
+        return np.clip(known, 0, 1).astype(np.float32, copy=False)
 
     def flag(self, name: str) -> NDArray:
         """Return a flag of each point (n,), 0 or 1; before PDAL 2.6 it is a bit of a dimension."""
