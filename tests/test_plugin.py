@@ -143,6 +143,32 @@ def test_all_stages_give_the_same_bytes(pipeline, ready_town, tmp_path):
     assert_same(tmp_path / "stock.las", tmp_path / "ours.las")
 
 
+@pytest.mark.parametrize("as_list", [True, False])
+@pytest.mark.parametrize("door", ["stock", "python-pdal", "pdal-stages"])
+def test_one_spelling_of_polygons(pipeline, python, ready_town, tmp_path, door, as_list):
+    """A comma in FILE=CODE:FROM,FROM means the same at all doors, in a list and in a text."""
+    pytest.importorskip("pyogrio")
+    before = laspy.read(ready_town)
+    (x0, x1), (y0, y1) = ((float(v.min()), float(v.max())) for v in (before.x, before.y))
+    corners = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
+    shape = {"type": "Polygon", "coordinates": [corners]}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    features = [{"type": "Feature", "properties": {}, "geometry": shape}]
+    lake = tmp_path / "lake.geojson"
+    lake.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}))
+    polygons = f"{lake}=9:2,6"
+    stage = {"type": "filters.polygons", "polygons": [polygons] if as_list else polygons}
+    stages = las([str(ready_town), stage], tmp_path / "o.laz")
+    if door == "stock":
+        pipeline(stages)
+    elif door == "python-pdal":
+        python(f"import pdal, json; pdal.Pipeline(json.dumps({stages!r})).execute()")
+    else:
+        ps.run_pipeline(stages)
+    codes, old = laspy.read(tmp_path / "o.laz").classification, before.classification
+    assert set(old[codes == 9].tolist()) == {2, 6} and not {2, 6} & set(codes.tolist())
+
+
 def test_objects_are_written(pipeline, ready_town, tmp_path):
     """The program of PDAL 2.2 has another GEOS and GDAL than Shapely and pyogrio bring: they work in a process apart."""
     pytest.importorskip("pyogrio")

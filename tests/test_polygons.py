@@ -162,6 +162,27 @@ def test_points_on_an_edge_are_inside():
     assert not points_inside(x, y, []).any() and not len(points_inside(x[:0], y[:0], [LAKE]))
 
 
+def test_points_inside_many_thin_polygons():
+    """They overlap, some twice, some are empty or have parts; points lie on edges, too."""
+    rng = np.random.default_rng(0)
+    ends = rng.uniform(0, 100, (400, 2, 2))
+    polygons = list(shapely.buffer(shapely.linestrings(ends), 0.2, quad_segs=1))
+    polygons += [*polygons[:5], shapely.Polygon(), shapely.box(20, 20, 30, 30)]
+    x, y = np.append(rng.uniform(-5, 105, (2, 3000)), [[20, 25, 20], [25, 30, 20]], axis=1)
+    expected = inside({"X": x, "Y": y}, shapely.union_all(polygons))
+    assert np.array_equal(points_inside(x, y, polygons), expected)
+    assert 0.3 < expected.mean() < 0.9 and expected[-3:].all()
+    assert not points_inside(x, y, []).any()
+
+
+def test_commas_may_be_split_or_joined():
+    """Stock PDAL splits the items of a list at commas."""
+    one, two = "a b,c.gpkg=9:2,6", "d=e.gpkg|layername=x=17:all"
+    parsed = [Overlay("a b,c.gpkg", "", 9, (2, 6)), Overlay("d=e.gpkg", "x", 17, ())]
+    for texts in ([one, two], [f"{one},{two}"], f"{one},{two}".split(",")):
+        assert Overlay.parse_all(texts) == parsed
+
+
 def test_what_is_wrong_is_said_before_any_work(tmp_path):
     with pytest.raises(StageError, match="the file of polygons does not exist"):
         Polygons({"polygons": [f"{tmp_path}/none.gpkg=9"]})

@@ -317,9 +317,7 @@ def whole_files(
             check_writable(target, what, kind_of(partial) or _OTHER)
             if check is not None:
                 check(partial, target, number)
-        remove_companions(target for _, target, _ in moves if not is_stream(target))
-        for partial, target, _ in moves:
-            _give_name(partial, target)
+        _give_names([(partial, target) for partial, target, _ in moves])
     except StageError as error:
         _name_final_paths(error, places)
         raise
@@ -372,6 +370,13 @@ def _name_final_paths(error: StageError, places: list[_Place]) -> None:
             error.found = error.found.replace(str(place.partial), str(place.path))
         if error.cure is None and disk_is_full(place.folder):
             error.cure = f"The disk of {place.path} is full: make room"
+
+
+def _give_names(moves: list[tuple[Path, Path]]) -> None:
+    """Move files to their final paths; what other programs left beside older ones goes."""
+    remove_companions(target for _, target in moves if not is_stream(target))
+    for partial, target in moves:
+        _give_name(partial, target)
 
 
 def _give_name(partial: Path, target: Path) -> None:

@@ -6,7 +6,7 @@ import ctypes
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +72,8 @@ def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
 
 #: Between a file and a layer of it, as QGIS writes them.
 _LAYER = "|layername="
+#: FILE=CODE, FILE=CODE:FROM,FROM or FILE=CODE:all at the beginning of a list of them.
+_OVERLAY = re.compile(r"\s*(.*?=\s*\d+\s*(?::\s*(?:all|\d+\s*(?:,\s*\d+\s*)*))?)(?:,|$)", re.DOTALL)
 #: Types of layers that may hold polygons.
 _POLYGONS = re.compile("Polygon|Surface|^Unknown$|^GeometryCollection$")
 #: West, south, east, north.
@@ -109,6 +111,16 @@ class Overlay:
                 "is named as in lakes.gpkg|layername=canals=9",
             )
         return cls(file.strip(), layer.strip(), int(code), tuple(map(int, replaced)))
+
+    @classmethod
+    def parse_all(cls, texts: Sequence[str]) -> list[Overlay]:
+        """Parse a list that may have been joined or split at any comma, as stock PDAL does."""
+        text, overlays = ",".join(texts), []
+        while text.strip():
+            match = _OVERLAY.match(text)
+            overlays.append(cls.parse(match[1] if match else text))
+            text = text[match.end() :] if match else ""
+        return overlays
 
     def find_layer(self) -> str:
         """Return the layer to read; StageError where there is not exactly one."""
@@ -203,11 +215,24 @@ def _horizontal(crs: Any) -> Any:
 def points_inside(
     x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]
 ) -> NDArray[np.bool_]:
-    """Return which points (n,) lie inside polygons, or on their edge."""
+    """Return which points (n,) lie inside polygons, or on their edge.
+
+    Each polygon is compared with the points in its box that lie in none before it.
+    """
     shapely, inside = vector("shapely"), np.zeros(len(x), bool)
-    whole = shapely.union_all(polygons)
-    west, south, east, north = whole.bounds
-    near = (x >= west) & (x <= east) & (y >= south) & (y <= north)
-    shapely.prepare(whole)
-    inside[near] = shapely.intersects_xy(whole, x[near], y[near])
-    return inside
+    order = np.argsort(x, kind="stable")
+    x, y = x[order], y[order]
+    boxes = shapely.bounds(np.array(polygons, object)).reshape(-1, 4)
+    first = np.searchsorted(x, boxes[:, 0])
+    last = np.searchsorted(x, boxes[:, 2], side="right")
+    for number in np.flatnonzero(first < last):  # an empty polygon has no box
+        _, south, _, north = boxes[number]
+        rows = slice(first[number], last[number])
+        near = np.flatnonzero(~inside[rows] & (y[rows] >= south) & (y[rows] <= north))
+        if len(near):
+            near += rows.start
+            shapely.prepare(polygons[number])
+            inside[near] = shapely.intersects_xy(polygons[number], x[near], y[near])
+    out = np.zeros(len(x), bool)
+    out[order] = inside
+    return out

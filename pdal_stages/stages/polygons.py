@@ -33,7 +33,7 @@ class Polygons(ClassStage):
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
-        self.overlays = [Overlay.parse(str(text)) for text in self.polygons]
+        self.overlays = Overlay.parse_all([*map(str, self.polygons)])
         for overlay in self.overlays:
             with_vector(overlay.find_layer)
 

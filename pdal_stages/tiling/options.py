@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -110,6 +111,9 @@ PER = ("file", "tile")
 #: Largest side of a tile, in units of the coordinates, and buffer: more than the Earth's
 #: circumference in feet.
 LARGEST_TILE = 1e9
+#: Smallest side of a tile, in units of the coordinates: a common step of coordinates, within which
+#: points have one place.
+SMALLEST_TILE = 1e-3
 # The bytes of memory follow measured peaks of workers, which a run's report has as
 # `peak_mb_of_a_worker`; docs/large-areas.md says how they add up.
 #: Bytes of a worker for programs and model.
@@ -164,7 +168,7 @@ class TilingOptions:
         """Check the options; OptionError where they are wrong or contradict each other."""
         # 20 and 20.0 are one run
         if self.tile is not None:
-            side = checks.number("--tile", self.tile, 0, LARGEST_TILE, above=True)
+            side = checks.number("--tile", self.tile, SMALLEST_TILE, LARGEST_TILE)
             object.__setattr__(self, "tile", side)
         if self.memory is not None:
             checks.whole("--memory", self.memory, 1, unit="bytes")
@@ -324,11 +328,8 @@ def tiles_per_square(
     room = ((options.memory or free_memory() // 2) - PARENT) / workers - BASE - STAGES
     most = min(_MOST_OF_A_TILE, room / TILE_POINT)
     fair = math.sqrt(density.area / workers) if workers > 1 else math.inf  # one for each worker
-    square = 1
-    while (
-        square * side < _HALOS_OF_A_SQUARE * halo_units
-        and (square + 1) * side <= fair
-        and density.read_by((square + 1) * side, halo_units) <= most
-    ):
-        square += 1
-    return square
+    wide = math.ceil(_HALOS_OF_A_SQUARE * halo_units / side)
+    fitting = bisect.bisect_right(
+        range(1, wide + 1), most, key=lambda square: density.read_by(square * side, halo_units)
+    )
+    return max(1, min(fitting, int(min(wide, fair / side))))

@@ -104,6 +104,7 @@ USAGE = {
     "unknown dimension": (["accuracy", "c.las", "--reference-dimension", "Clasification"], "Did you mean 'Classification'?"),
     "scheduler without its protocol": (["classify", "c.las", "o", "--scheduler", "localhost"], "missing port number"),
     "a buffer larger than the Earth": (["pipeline", "job.json", "--tile", "50", "--buffer", "1e308"], "1e+09 meters"),
+    "tiles of a nanometer": (["classify", "c.las", "o", "--tile", "1e-9"], "from 0.001 to 1e+09"),
     "unknown flag": (["validate", "job.json", "--strict"], "unrecognized arguments: --strict"),
     "no pipeline file": (["pipeline"], "no pipeline file was given"),
     "options of a stage that is not there": (["options", "filters.hag_minimum"], "Did you mean 'filters.hag_minima'?"),
