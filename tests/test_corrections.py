@@ -216,3 +216,33 @@ def test_training_on_corrections_keeps_the_base_where_it_is_sure(town, tmp_path,
     assert code == 0 and sentence in err + out
     info = ps.load_model(str(model)).info
     assert info["sureness"]["about"].startswith("its base (")
+
+
+@pytest.mark.pdal
+def test_folders_are_corrected_as_files_are(town, tmp_path, run):
+    """Files by name; those without changes are not written, and an error leaves none."""
+    las = laspy.read(town)
+    part = np.floor((las.x - las.x.min()) / 30).astype(int)
+    (tmp_path / "before").mkdir()
+    (tmp_path / "after").mkdir()
+    for number in range(3):
+        piece = laspy.LasData(las.header, las.points[part == number])
+        piece.write(tmp_path / "before" / f"t{number}.laz")
+        if number < 2:
+            piece.classification[: 100 * number] = 6
+            piece.write(tmp_path / "after" / f"t{number}_edited.laz")
+    out = tmp_path / "checked"
+    words = ["corrections", tmp_path / "before", tmp_path / "after", "--out", out]
+    code, text, err = run(*words)
+    assert code == 0, err
+    assert "2 of 3 files were not written" in text
+    assert [path.name for path in out.iterdir()] == ["t1.laz"]
+    assert np.asarray(laspy.read(out / "t1.laz")["Checked"])[:100].mean() > 0.9
+    one = tmp_path / "one.laz"
+    files = [tmp_path / name for name in ("before/t1.laz", "after/t1_edited.laz")]
+    assert run("corrections", *files, "--out", one)[0] == 0
+    assert one.read_bytes() == (out / "t1.laz").read_bytes()
+    (tmp_path / "after" / "another.laz").write_bytes(files[1].read_bytes())
+    (out / "t1.laz").unlink()
+    code, _, err = run(*words)
+    assert code == 1 and "another.laz" in err and not list(out.iterdir())

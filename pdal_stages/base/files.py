@@ -353,7 +353,8 @@ class _Place:
         """Return the files that were written, and the names they are to get."""
         files = sorted(self.folder.iterdir())
         if self.partial not in files and "#" not in self.path.name:
-            raise StageError("the writer wrote no file", found=str(self.path))
+            cure = "Name a file whose suffix says what it is, such as .laz"
+            raise StageError("the writer wrote no file", found=str(self.path), cure=cure)
         return [(f, self.path if f == self.partial else self.path.with_name(f.name)) for f in files]
 
     def close(self) -> None:

@@ -36,9 +36,15 @@ def add_commands(parser: Parser) -> None:
 
     what = "Mark points that a person corrected or confirmed, to train on"
     add = parser.command("corrections", _corrections, what)
-    add("before", help="LAS or LAZ file as classified")
-    add("after", nargs="?", help="The same points after a person's corrections, in any order")
-    add("--out", required=True, metavar="FILE", help="File to write: new classes, and Checked")
+    after = "The same points after a person's corrections, in any order; of files those corrected"
+    add("before", help="LAS or LAZ file, folder or pattern, as classified")
+    add("after", nargs="?", help=after)
+    add(
+        "--out",
+        required=True,
+        metavar="FILE",
+        help="File or folder to write: new classes, and Checked",
+    )
     area = "Polygons in which all points were checked; with a column 'done', those with 1"
     add("--area", action="append", default=[], metavar="FILE", help=area)
     radius = "Radius checked around changes (1)"

@@ -113,10 +113,12 @@ def is_las(name: str) -> bool:
 def is_folder(target: str) -> bool:
     """Return whether an output is a folder: an existing one, or a name that looks like one.
 
-    Such a name ends with a slash, or has neither a suffix nor '#'.
+    Such a name ends with a slash, or has neither a suffix nor '#'. What begins with a digit, as in
+    ``out_v1.2``, is no suffix of a file.
     """
     path = Path(target)
-    named = "#" not in path.name and not path.suffix and not path.exists()
+    has_suffix = path.suffix and not path.suffix[1:2].isdigit()
+    named = "#" not in path.name and not has_suffix and not path.exists()
     return path.is_dir() or target.endswith(("/", os.sep)) or named
 
 

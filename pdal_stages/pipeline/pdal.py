@@ -144,7 +144,8 @@ def with_types(
             if not name or not stage["type"]:
                 what = f"PDAL has no {kind} for a file of this name"
                 what = what if name else "a stage has neither a type nor the name of a file"
-                cure = "Is the suffix mistyped (.laz, .las)? Otherwise give the stage a type: "
+                cure = "Is the suffix mistyped (.laz, .las)? A folder is named with a slash at its "
+                cure += "end. Otherwise give the stage a type: "
                 place = where(number) if where else None
                 raise PipelineError(what, where=place, found=name, cure=f'{cure}"{kind}s.las"')
         if stage["type"] == "readers.las" and not stage.keys() & {"extra_dims", "ignore_vlr"}:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +22,8 @@ from ..base.grid import places_among
 from ..base.las import named_copc
 from ..base.vector import Overlay, points_inside, polygons_of, reading, vector
 from ..classifier.input_dimensions import CHECKED
+from ..pipeline.accuracy_files import paired
+from ..pipeline.inputs_outputs import input_files, is_folder, outputs_of
 from ..pipeline.las_files import can_read_chunks, finish, laspy_header, read_chunks
 from ..pipeline.spatial_reference import reference_of_file
 
@@ -35,10 +41,23 @@ DONE = "done"
 _DISTINGUISHING = ("gps_time", "return_number", "number_of_returns", "classification")
 
 
+class _NothingCheckedError(StageError):
+    """No point of a file was changed, or lies where everything was checked."""
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A file before and after editing, and the file to write."""
+
+    before: str
+    after: str  #: empty where nothing was edited
+    output: str
+
+
 def write_corrections(
     before: str, output: str, after: str = "", areas: Sequence[str] = (), radius: float = 1.0
 ) -> list[str]:
-    """Write the points of a file with corrected classes, and mark those that were checked.
+    """Write the points of files with corrected classes, and mark those that were checked.
 
     The Reliability of checked points becomes 1. Everything else stays as in `before`, whatever the
     editing program dropped.
@@ -46,11 +65,13 @@ def write_corrections(
     Parameters
     ----------
     before : str
-        LAS or LAZ file before editing.
+        LAS or LAZ file before editing; or a folder or pattern of such files, of which those are
+        written in which anything was checked, all or none.
     output : str
-        LAS or LAZ file to write.
+        LAS or LAZ file to write; of several files a folder, or a name with ``#`` for theirs.
     after : str
-        File of the same points after editing, in any order; empty for none.
+        The same points after editing, in any order: a file, or a folder or pattern of files with
+        the names of those before, or parts of them; empty for none.
     areas : sequence of str
         Files of polygons in which everything was checked, so unchanged classes are right.
     radius : float
@@ -61,32 +82,96 @@ def write_corrections(
     list of str
         Counts and warnings.
     """
-    _refuse_inputs(before, output, after, areas, radius)
+    checks.number("'--around'", radius, 0, 100, unit="m")
+    if not after and not areas:
+        raise OptionError(
+            "there is nothing to mark: neither corrected points nor a checked area",
+            cure="Give the corrected file as the second argument, or --area patches.gpkg",
+        )
+    pairs = _pairs(before, after, output)
+    _refuse_files(pairs, areas)
+    lines: list[str] = []
+    untouched: list[StageError] = []
+    missed: dict[str, list[StageError]] = {area: [] for area in areas}
+    with ExitStack() as outputs:  # all get their names, or none
+        for pair in pairs:
+            try:
+                result = _correct(pair, missed, radius, outputs)
+            except _NothingCheckedError as error:
+                untouched.append(error)
+                continue
+            lines += [f"{pair.before}:"] * (len(pairs) > 1) + result
+        for errors in (*missed.values(), untouched):
+            if len(errors) == len(pairs):
+                raise errors[0]
+    if untouched:
+        lines.append(
+            f"{len(untouched):,} of {len(pairs):,} files were not written: in them nothing "
+            "was changed or checked"
+        )
+    return lines
+
+
+def _pairs(before: str, after: str, output: str) -> list[_Pair]:
+    """Return the files before and after editing, and those to write."""
+    files = input_files([before])
+    edited = input_files([after]) if after else []
+    if len(files) == 1 and not Path(before).is_dir() and not is_folder(output):
+        if len(edited) > 1:
+            raise StageError(
+                "several files are the corrections of one", found=", ".join(edited[:3])
+            )
+        return [_Pair(files[0], edited[0] if edited else "", output)]
+    if is_folder(output):
+        os.makedirs(output, exist_ok=True)
+        output = os.path.join(output, "#")
+    outputs = outputs_of(files, output)
+    try:
+        partners = {one: other for other, one in paired(edited, files)} if edited else {}
+    except StageError as error:
+        what = "each corrected file needs one before editing, of which its name tells"
+        raise StageError(what, found=error.found, cure=error.cure) from None
+    return [
+        _Pair(file, partners.get(file, ""), name) for file, name in zip(files, outputs, strict=True)
+    ]
+
+
+def _correct(
+    pair: _Pair, missed: dict[str, list[StageError]], radius: float, outputs: ExitStack
+) -> list[str]:
+    """Write a file, which gets its name when `outputs` are closed; return counts and warnings.
+
+    `missed` has the areas, and of each why files have no point in it.
+    """
+    before = pair.before
     reference = reference_of_file(before)
     las = _read(before)
     xyz = np.column_stack([las.x, las.y, las.z])
     codes = np.asarray(las.classification).astype(np.uint8)
     warnings: list[str] = []
-    new = _edited_codes(before, after, las, xyz, codes, warnings) if after else codes
+    new = _edited_codes(before, pair.after, las, xyz, codes, warnings) if pair.after else codes
     changed = new != codes
     units = reference.units
     meters = xyz * [units.horizontal, units.horizontal, units.vertical]
     checked = is_near(meters, changed, radius)
-    for area in areas:
-        checked |= _in_area(area, xyz, reference.wkt, warnings)
+    for area, errors in missed.items() if len(xyz) else ():
+        try:
+            checked |= _in_area(area, xyz, reference.wkt, warnings)
+        except _NothingCheckedError as error:
+            errors.append(error)
     if CHECKED in las.point_format.extra_dimension_names:
         checked |= np.asarray(las[CHECKED]) > 0
     elif CHECKED in las.point_format.dimension_names:
         raise StageError(f"'{CHECKED}' is a dimension of another kind", where=before)
     if not checked.any():
-        raise StageError(
+        raise _NothingCheckedError(
             "nothing was changed, and no point lies in a checked area",
-            found=", ".join(filter(None, (after, *areas))),
+            found=", ".join(filter(None, (pair.after, *missed))),
         )
     _store(las, new, checked, before)
-    with whole_files(output) as (part,):
-        las.write(str(part))
-        finish(part, [before])
+    (part,) = outputs.enter_context(whole_files(pair.output))
+    las.write(str(part))
+    finish(part, [before])
     return [*_describe(codes, new, checked), *warnings]
 
 
@@ -99,23 +184,17 @@ def _describe(codes: NDArray, new: NDArray, checked: NDArray) -> list[str]:
     return [f"{counts} ({percent})", *lines]
 
 
-def _refuse_inputs(
-    before: str, output: str, after: str, areas: Sequence[str], radius: float
-) -> None:
-    checks.number("'--around'", radius, 0, 100, unit="m")
-    if not after and not areas:
-        raise OptionError(
-            "there is nothing to mark: neither corrected points nor a checked area",
-            cure="Give the corrected file as the second argument, or --area patches.gpkg",
-        )
-    inputs = [*filter(None, (before, after))]
+def _refuse_files(pairs: Sequence[_Pair], areas: Sequence[str]) -> None:
+    """Refuse inputs that cannot be read in parts, and outputs that cannot be written."""
+    inputs = [name for pair in pairs for name in (pair.before, pair.after) if name]
     for name in inputs:
         if not can_read_chunks(name):
             raise StageError("corrections are read from LAS and LAZ files", found=name)
-    if named_copc(output):
-        what = "corrections are written as LAS or LAZ"
-        raise OptionError(what, found=output, cure="Name it .laz")
-    check_outputs([Output(output, "output")], [*inputs, *areas])
+    for pair in pairs:
+        if named_copc(pair.output):
+            what = "corrections are written as LAS or LAZ"
+            raise OptionError(what, found=pair.output, cure="Name it .laz")
+    check_outputs([Output(pair.output, "output") for pair in pairs], [*inputs, *areas])
 
 
 def _store(las: Any, codes: NDArray[np.uint8], checked: NDArray[np.bool_], before: str) -> None:
@@ -198,13 +277,13 @@ def _in_area(
     box = float(x.min()), float(y.min()), float(x.max()), float(y.max())
     shapes, note = polygons_of(Overlay(file, layer, 0, ()), wkt, box, where=condition)
     if condition and not shapes:
-        raise StageError(
+        raise _NothingCheckedError(
             "no patch is marked as checked",
             where=area,
             cure=f"Set '{DONE}' to 1 where all errors were corrected, e.g. in QGIS",
         )
     if not shapes:
-        raise StageError(
+        raise _NothingCheckedError(
             "no polygon of the area overlaps the points",
             where=area,
             found=note or "none within the bounding box of the points",
