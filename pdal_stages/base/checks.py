@@ -70,7 +70,8 @@ def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
     known = list(choices)
     if not any(type(value) is type(choice) and value == choice for choice in known):
         raise OptionError(
-            f"{what} must be one of {', '.join(map(repr, known))}",
+            f"{what} must be {'one of ' * (len(known) > 1)}{', '.join(map(repr, known))}"
+            + ", or left out" * (len(known) == 1),
             found=_shown(value),
             cure=suggest(str(value), map(str, known)) or None,
         )
@@ -124,23 +125,43 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+#: No option, pipeline or manifest has lists and objects as deep inside each other; deeper ones
+#: would exceed Python's recursion somewhere.
+MOST_NESTED = 100
+
+
 def strict_json(text: str | bytes) -> Any:
     """Parse a JSON text without NaN, numbers beyond a double (1e999) and duplicate keys.
 
     Raises
     ------
     ValueError
-        If it is not JSON, a number is not finite, or an object has a key twice.
+        If it is not JSON, a number is not finite, an object has a key twice, or values are nested
+        too deeply.
     RecursionError
-        If it is nested too deeply.
+        If it is nested much too deeply.
     """
-    return json.loads(
+    value = json.loads(
         text,
         parse_constant=refuse_constant,
         parse_float=_finite,
         parse_int=lambda word: _finite(word, int),
         object_pairs_hook=_unique,
     )
+    refuse_nested(value)
+    return value
+
+
+def refuse_nested(value: Any) -> None:
+    """Refuse lists and objects inside each other, more than `MOST_NESTED` deep, by ValueError."""
+    level = [value]
+    for _ in range(MOST_NESTED + 1):
+        lists = [each for each in level if isinstance(each, list | tuple)]
+        objects = [each.values() for each in level if isinstance(each, Mapping)]
+        level = [inner for each in (*lists, *objects) for inner in each]
+        if not level:
+            return
+    raise ValueError(f"it is nested more than {MOST_NESTED} deep")
 
 
 def refuse_constant(word: str) -> None:

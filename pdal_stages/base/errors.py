@@ -35,11 +35,12 @@ class StageError(Exception):
 
     def __str__(self) -> str:
         """Return place, problem, found value and cure as sentences."""
-        # A file's name may hold line breaks, and must not pass for lines of its own.
-        text = f"{self.where}: {self.what}".replace("\n", "\\n") if self.where else self.what
+        text = f"{self.where}: {self.what}" if self.where else self.what
         if self.found is not None:
             text += f" (found {self.found})"
-        return _sentence(text) + (f" {_sentence(self.cure)}" if self.cure else "")
+        text = _sentence(text) + (f" {_sentence(self.cure)}" if self.cure else "")
+        # Names of files and dimensions may hold line breaks, and must not pass for lines.
+        return text.replace("\n", "\\n").replace("\r", "\\r")
 
     def at(self, where: str) -> StageError:
         """Name the place of the error unless it already has one; return the error."""

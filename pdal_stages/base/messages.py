@@ -21,10 +21,15 @@ def one_line(text: str) -> str:
     return plain(text).replace("\n", "\\n")
 
 
+def shorten(text: str, most: int = 200) -> str:
+    """Return a text of at most about `most` characters, and how long it was where it is cut."""
+    return text if len(text) <= most else f"{text[:most]}... ({len(text):,} characters)"
+
+
 def print_messages(*lines: str) -> None:
-    """Print messages for the user on standard error."""
+    """Print messages for the user on standard error, each on one line."""
     for line in lines:
-        print(f"pdal-stages: {line}", file=sys.stderr)
+        print(f"pdal-stages: {one_line(line)}", file=sys.stderr)
 
 
 def count_of(count: int, word: str) -> str:

@@ -81,9 +81,9 @@ def _usable_clouds(
         clouds = spooled(clouds, folder)
     if usable := [cloud for cloud in clouds if len(cloud)]:
         return usable
-    left_out = ", ".join(map(str, options.ignore))
+    labels = " and ".join(map(str, options.ignore)) or "none"
     raise OptionError(
         "there are no points to train on",
-        cure=f"Give some; those of labels {left_out} are left out ('ignore') unless 'classes' "
-        "names them",
+        cure="Give some. Left out are points that are withheld or that 'ignore' names otherwise, "
+        f"and those of its labels ({labels}) unless 'classes' names them",
     )

@@ -123,5 +123,5 @@ def _classify_whole(task: ClassifyTask, options: argparse.Namespace) -> TiledRun
         print("1 input, in one piece")
     else:
         print_messages(*run.messages)
-        print(f"{count_of(run.summary['points'], 'point')} written to {task.outputs[0]}")
+        print(f"{count_of(run.summary['points'], 'point')} written to {one_line(task.outputs[0])}")
     return run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from ..base.messages import one_line
 from .parser import Parser, add_stage_options, stage_options
 
 #: Options of ``writers.objects`` that ``objects`` has flags for.
@@ -75,7 +76,8 @@ def _review(options: argparse.Namespace) -> None:
     settings = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
     review = write_review(options.inputs, options.output, options.json or "", **settings)
     print("\n".join(lines(review.to_dict())))
-    print(f"written to {', '.join(name for name in (options.output, options.json) if name)}")
+    names = [name for name in (options.output, options.json) if name]
+    print(one_line(f"written to {', '.join(names)}"))
 
 
 def _corrections(options: argparse.Namespace) -> None:
@@ -83,9 +85,9 @@ def _corrections(options: argparse.Namespace) -> None:
     from ..review.corrections import write_corrections
 
     files = options.before, options.out, options.after or ""
-    print("\n".join(write_corrections(*files, options.area, options.around)))
+    print("\n".join(map(one_line, write_corrections(*files, options.area, options.around))))
     train = f"pdal-stages train --base MODEL {options.out} --model NEW"
-    print(f"written to {options.out}; next: {train}")
+    print(one_line(f"written to {options.out}; next: {train}"))
 
 
 def _demo(options: argparse.Namespace) -> None:

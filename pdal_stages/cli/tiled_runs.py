@@ -15,7 +15,7 @@ from ..base.asprs import class_name
 from ..base.errors import OptionError
 from ..base.files import JSON, Output, write_json
 from ..base.memory import parse_size
-from ..base.messages import count_of, print_messages
+from ..base.messages import count_of, one_line, print_messages
 from ..stages.registry import describe_count
 from ..tiling.options import PER, TilingOptions
 from .parser import Parser
@@ -148,7 +148,7 @@ def print_output(job: Job, names: Mapping[int, str]) -> None:
         for code, n in sorted(classes.items())
     )
     points = count_of(job.record.get("written", 0), "point")
-    print(f"{job.outputs[0]}: {points}{f'; {shares}' if shares else ''}", flush=True)
+    print(f"{one_line(job.outputs[0])}: {points}{f'; {shares}' if shares else ''}", flush=True)
 
 
 def print_run(run: TiledRun) -> None:

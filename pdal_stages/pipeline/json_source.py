@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base.checks import refuse_constant
+from ..base.checks import refuse_constant, refuse_nested
 from ..base.errors import OptionError, PipelineError, suggest
 
 #: No pipeline file has as many bytes; devices, such as /dev/zero, have no end.
@@ -156,6 +156,7 @@ def _checked(source: PipelineSource) -> PipelineSource:
 def _check_values(stage: Any, where: str) -> None:
     """Refuse values that PDAL cannot take: it needs UTF-8 without NUL, and finite numbers."""
     try:
+        refuse_nested(stage)
         text = json.dumps(stage, allow_nan=False, ensure_ascii=False)
         text.encode()
         if "\\u0000" in text.replace("\\\\", ""):  # a backslash before it makes it a text

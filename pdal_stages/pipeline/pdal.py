@@ -310,7 +310,7 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
     if re.search(r"(create|load|find).*filters\.python", text) or (
         "filters.python" in text and "driver" in text.lower()
     ):
-        return DependencyError("PDAL has no filters.python", found=text, cure=_DRIVER_CURE)
+        return DependencyError("PDAL has no filters.python", found=one_line, cure=_DRIVER_CURE)
     if "ModuleNotFoundError" in text and "pdal_stages" in text:
         cure = "Install it into the Python that the plugin of filters.python was built for"
         what = "the Python that PDAL runs does not have pdal_stages"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.asprs import NOISE, OVERLAP
 from ..base.errors import OptionError, suggest
+from ..base.messages import shorten
 
 #: Noise, and points that their supplier withheld: by default neither neighbors nor overwritten.
 UNWANTED = (*NOISE, "withheld")
@@ -186,7 +187,7 @@ class Option:
 
     def _wrong(self, value: Any) -> OptionError:
         what = f"option '{self.name}' must be {_KINDS[self.kind][1]}"
-        return OptionError(what, found=json.dumps(value, default=str))
+        return OptionError(what, found=shorten(json.dumps(value, default=str)))
 
     def _parse_number(self, value: Any) -> float:
         with suppress(ValueError):
@@ -331,6 +332,10 @@ def parse_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[st
     values: dict[str, Any] = {}
     for name, option in known.items():
         if name in raw:
+            try:
+                checks.refuse_nested(raw[name])
+            except ValueError as error:
+                raise OptionError(f"option '{name}' cannot be read", found=error) from None
             values[name] = option.parse(raw[name])
         elif option.required:
             raise OptionError(f"option '{name}' is required", cure=option.help)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.errors import DimensionError, OptionError, StageError
 from ..base.memory import release_pages
-from ..base.messages import Report
+from ..base.messages import Report, shorten
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .options import Selection
 from .where_expression import Expression
@@ -88,7 +88,7 @@ class Points:
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             # Where `classify` marked no point, the stage that marks them has said so.
             if self.count and not self.report.figures["where"] and SELECTED not in self.where.text:
-                self.report.warnings.append(f"{NO_POINT_MATCHES} {self.where.text}")
+                self.report.warnings.append(f"{NO_POINT_MATCHES} {shorten(self.where.text)}")
 
     @property
     def inside(self) -> NDArray[np.bool_]:

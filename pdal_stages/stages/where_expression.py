@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, OptionError, suggest
+from ..base.messages import shorten
 
 _TOKEN = re.compile(
     r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
@@ -101,7 +102,7 @@ class Expression:
     def _error(self, what: str) -> OptionError:
         return OptionError(
             f"the 'where' expression cannot be read: {what}",
-            found=repr(self.text),
+            found=repr(shorten(self.text)),
             cure='Example: "Classification == 2 && Z > 3"',
         )
 

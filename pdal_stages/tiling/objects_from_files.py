@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import OptionError
 from ..base.files import JSON, Output, check_outputs, write_json
-from ..base.messages import print_messages
+from ..base.messages import one_line, print_messages
 from ..base.units import Units
 from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
@@ -52,7 +52,7 @@ def objects_of_files(
         print(f"{counts['objects']:,} {word}, {counts['to_be_checked']:,} to be checked")
         for reason, count in counts["reasons"].items():
             print(f"  {reason:28s} {count:>10,}")
-    print("written to " + ", ".join(files))
+    print(one_line("written to " + ", ".join(files)))
     if metadata:
         about = {
             "version": __version__,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from robustness_kit import HAG, job
 
@@ -35,6 +36,9 @@ WRONG = {
     "where that does not parse": (HEIGHTS, {"where": "Z >> 3"}, ["'where' expression", "not a condition", "Example"]),
     "where that is no condition": (HEIGHTS, {"where": "Z + 3"}, ["gives a number, not true or false"]),
     "where nested 1,000 deep": (HEIGHTS, {"where": "(" * 1000 + "Z>1" + ")" * 1000}, ["'where' expression"]),
+    "where of 20 kB": (HEIGHTS, {"where": "Z > 3 && " * 2500 + "X"}, ["'where' expression", "(22,501 characters)"]),
+    "depth of a number": (TRAIN, {"filename": "m", "max_depth": 1}, ["option 'max_depth'"]),
+    "another depth": (TRAIN, {"filename": "m", "max_depth": "1"}, ["'max_depth' must be 'sqrt', or left out"]),
     "unknown unit": (HEIGHTS, {"horizontal_unit": "foots"}, ["not a known length unit", "Did you mean"]),
     "label mapping to no class": (TRAIN, {"filename": "m", "classes": {"2,3": "Grond"}}, ["Grond"]),
     "label mapped twice": (TRAIN, {"filename": "m", "classes": {"2": 2, "2,3": 5}}, ["label twice"]),
@@ -134,3 +138,59 @@ def test_wheres_of_no_point_and_of_many_terms(command, tmp_path, cloud):
     assert "'where' matches no points: Z > 1e6" in done.err
     where = " || ".join(f"Classification == {k % 256}" for k in range(4_000))
     command.runs(["pipeline", job(tmp_path, cloud, {**HAG, "where": where})])
+
+
+@pytest.mark.parametrize("deep", [150, 900, 5000])
+def test_options_nested_too_deeply(command, tmp_path, monkeypatch, deep):
+    """Lists, or objects, in any option; also where Python gives them."""
+    monkeypatch.chdir(tmp_path)
+    for text in ("[" * deep + "]" * deep, '{"a":' * deep + "1" + "}" * deep):
+        for stage, option in ((HEIGHTS, "ignore"), (TRAIN, "classes"), ("filters.crop", "bounds")):
+            (tmp_path / "job.json").write_text(
+                f'["in.las", {{"type": "{stage}", "{option}": {text}}}, "o.las"]'
+            )
+            message = command.refused(["pipeline", tmp_path / "job.json"])
+            assert "nested" in message or "recursion" in message
+            assert len(message) < 600
+    value = []
+    for _ in range(deep):
+        value = [value]
+    with pytest.raises(StageError, match="nested more than"):
+        ps.Filter.hag_morphological(ignore=value)
+    with pytest.raises(StageError, match="nested more than"):
+        ps.run_pipeline([{"type": HEIGHTS, "ignore": value}])
+
+
+def test_a_long_where_that_matches_nothing_is_printed_in_part(command, tmp_path, cloud):
+    where = " || ".join(["Z > 1e9"] * 2000)
+    path = job(tmp_path, cloud, {"type": HEIGHTS, "where": where}, OUT)
+    message = command.runs(["pipeline", path]).err
+    assert "'where' matches no points: Z > 1e9 ||" in message and len(message) < 1000
+
+
+def test_line_breaks_in_names_are_printed_as_codes(command, tmp_path, write_las):
+    """Of dimensions and files, in errors and in results."""
+    x, y = np.random.default_rng(0).uniform(0, 30, (2, 500))
+    arrays = {"X": x, "Y": y, "Z": 0 * x, "Classification": np.full(500, 2, np.uint8)}
+    arrays |= {"a\nb 100 %": x, "Checked": np.ones(500, np.uint8)}
+    source = write_las(tmp_path / "in\n2 Ground.las", arrays, point_format=6)
+    out = tmp_path / "out\n2 Ground.laz"
+    for words in (
+        ["accuracy", source, "--reference-dimension", "Nothing"],
+        ["corrections", source, source, "--out", out],
+        ["objects", source, tmp_path / "o\n2 Ground.gpkg"],
+        ["classify", source, out],
+    ):
+        done = command(*words)
+        for line in (done.out + done.err).splitlines():
+            assert not line.startswith(("2 Ground", "b 100 %")), (words, line)
+
+
+def test_all_points_are_withheld(command, tmp_path, write_las):
+    x, y = np.random.default_rng(0).uniform(0, 30, (2, 500))
+    arrays = {"X": x, "Y": y, "Z": 0 * x, "Withheld": np.ones(500, np.uint8)}
+    arrays["Classification"] = np.repeat([2, 5], 250).astype(np.uint8)
+    source = write_las(tmp_path / "in.las", arrays, point_format=6)
+    command.refused(
+        ["train", source, "--model", tmp_path / "m.model"], "Left out are points that are withheld"
+    )
