@@ -29,14 +29,14 @@ def page(stage: type[Stage]) -> str:
     lines += [text, ""]
     if "## Dimensions" not in text:
         instance = stage({name: value for name, value in example(stage).items() if name != "type"})
-        reads, creates = instance.reads(), instance.creates()
+        reads, written = instance.reads(), instance.written_dimensions()
         lines += [
             "## Dimensions",
             "",
             f"- Reads: X, Y, Z{''.join(f', {name}' for name in reads)}",
             "- Writes: "
-            f"{', '.join(f'`{name}` ({kind})' for name, kind in list(creates.items())[:8]) or 'none'}"
-            + (f" and {len(creates) - 8} more" if len(creates) > 8 else ""),
+            + ("; ".join(map(_described, written[:8])) or "none")
+            + (f"; and {len(written) - 8} more" if len(written) > 8 else ""),
             f"- Halo: {instance.halo_m():g} m round a tile, with the example's options",
             "",
         ]
@@ -63,6 +63,11 @@ def example(stage: type[Stage]) -> dict[str, Any]:
         for stage_json in pipeline
         if isinstance(stage_json, dict) and stage_json.get("type") == stage.type
     )
+
+
+def _described(dimension) -> str:
+    unit = "" if dimension.unit == "1" else f", {dimension.unit}"
+    return f"`{dimension.name}` ({dimension.type}{unit}): {dimension.meaning}"
 
 
 def _row(option) -> str:

@@ -45,3 +45,12 @@ def test_scale_and_offset_of_a_file_do_not_change_coordinates(scale):
     first, two = (Points(dict.fromkeys("XYZ", values)).axes for values in (plain, other))
     assert all(np.array_equal(a, b) for a, b in zip(first, two, strict=True))
     assert np.abs(first[0] - plain).max() < 1e-8
+
+
+def test_a_height_in_feet_is_told_by_its_dimension_not_by_its_prefix():
+    """Heights above ground have the unit of Z; features are lengths in meters."""
+    values = {"HeightAboveGround": np.full(1000, 10.0), "HeightAboveOpening_5": np.full(1000, 10.0)}
+    meters = {"HeightAboveLowest_s2": np.full(1000, 10.0), "HeightAboveSea": np.full(1000, 10.0)}
+    points = Points({**arrays(), **values, **meters}, unit_names=("foot", "foot"))
+    assert all((points.dimension(name) == 3.048).all() for name in values)
+    assert all((points.dimension(name) == 10.0).all() for name in meters)

@@ -218,7 +218,7 @@ class FeatureEngine:
         Parameters as for :meth:`run`.
         """
         run = self.run(queries, **options)
-        values = np.empty((len(run.grid.order), len(self.plan.names)), np.float32)
+        values = np.full((len(run.grid.order), len(self.plan.names)), np.nan, np.float32)
         for block in run.computed(progress):
             values[block.positions] = block.values
         return FeatureTable(values, self.plan.names, self.bins, self.copt_threshold, self.report)
@@ -289,7 +289,7 @@ class Run:
         copies = np.diff(at, append=last)
         points = grid.x[at], grid.y[at], grid.z[at]
         width = len(plan.names)
-        values = np.empty((len(at), width), np.float32)
+        values = np.full((len(at), width), np.nan, np.float32)  # a column that no kernel writes
         few: dict[str, int] = {}
         far: dict[str, int] = {}
         reach = 0.0

@@ -358,8 +358,9 @@ def finish(table, volume, heights, few, copies, columns, out):
         Column of `out` (m, F) float32 for each row of :data:`ROW`; -1: not wanted. The normal is
         (0, 0, 0) where there is none.
     """
-    # Of constant shapes: rows known not to overlap let the loops be vectorized.
-    values, m = np.empty((FEATURES, WIDTH)), np.empty((len(C), WIDTH))
+    # Of constant shapes: rows known not to overlap let the loops be vectorized. A feature without
+    # a line below stays NaN.
+    values, m = np.full((FEATURES, WIDTH), np.nan), np.empty((len(C), WIDTH))
     for start in range(0, len(heights), BATCH):
         count = min(BATCH, len(heights) - start)
         moments = table[:, start : start + count]

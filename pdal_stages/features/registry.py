@@ -1,9 +1,9 @@
 """The registry of features: names, groups, units and definitions, in the order of the columns.
 
 A new feature is one entry here and its value in ``features/moments.py``, without which its column
-holds whatever was in memory; what goes with it is in CONTRIBUTING.md, "Checklists". Columns, groups
-and kernel rows follow. Model files name their features one by one, so none of them needs to be
-trained again.
+is NaN and tests/test_every_feature.py fails; what goes with it is in CONTRIBUTING.md, "Checklists".
+Columns, groups and kernel rows follow. Model files name their features one by one, so none of them
+needs to be trained again.
 
 [B16], [W18] and [H17] are cited in :mod:`.neighborhoods`; [HWS16] is Hackel, Wegner, Schindler
 2016, ISPRS Annals III-3, 177-184.

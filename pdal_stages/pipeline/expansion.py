@@ -13,9 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ..base.dimensions import known
 from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.las_repair import extra_dimensions
 from ..classifier.model_file import find
+from ..features.registry import BY_NAME
 from ..stages import preprocessing
 from ..stages.base import Stage
 from ..stages.points import MAKERS
@@ -215,8 +217,6 @@ def _place_upstream(expanded: Expanded) -> None:
         before.append((ours.as_written, ours.stage.creates()))
 
 
-#: Prefixes of dimensions that come only from a stage or from extra bytes.
-_CREATED = ("HeightAbove", "Ground", "Slope", "Reference")
 #: Stages of PDAL that may create dimensions of any name.
 _CREATES_ANY = {
     f"filters.{name}" for name in ("python", "matlab", "colorization", "overlay", "hag_dem")
@@ -239,7 +239,7 @@ def check_dimensions(expanded: Expanded) -> None:
                 "projected reference",
             )
         for name in ours.stage.reads():
-            if name.startswith(_CREATED) and not any(
+            if _is_created(name) and not any(
                 name in of_ours[index] if index in of_ours else _may_create(name, stage)
                 for index, stage in before
             ):
@@ -249,6 +249,12 @@ def check_dimensions(expanded: Expanded) -> None:
                     where=ours.stage.place,
                     cure=ours.stage.hint or MAKERS.get(name),
                 )
+
+
+def _is_created(name: str) -> bool:
+    """Return whether a dimension comes only from a stage or from extra bytes."""
+    feature = any(name.startswith(f"{feature}_") for feature in BY_NAME)
+    return feature or (known(name) is not None and name != "Classification")
 
 
 def _may_create(name: str, stage: Mapping[str, Any]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
 from typing import Any
@@ -17,6 +18,15 @@ from ..base.asprs import (
     TERRAIN,
     by_height,
 )
+from ..base.dimensions import (
+    CLASSIFICATION,
+    HEIGHT,
+    MARGIN,
+    RELIABILITY,
+    VARIANCE,
+    Dimension,
+    probability,
+)
 from ..base.errors import OptionError
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, median_slope
@@ -30,8 +40,7 @@ from .options import Selection, ignore_option, keep_option, option
 from .points import LAS_DIMENSIONS, Points, class_counts
 from .preprocessing import as_json, same, with_given_ground
 
-#: Dimension of the height above ground.
-HEIGHT = "HeightAboveGround"
+_HEIGHT = HEIGHT.name
 #: Distance from given ground, in meters, up to which points without the dimension Ground may become
 #: ground: the default threshold of filters.hag_morphological.
 _TOLERANCE_M = FilterOptions.threshold
@@ -114,7 +123,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
         self.limits  # noqa: B018  refused here where nothing is known of the model
         if self.mark and not re.fullmatch(r"[A-Za-z]\w*", self.mark):
             raise OptionError("option 'mark' must be a name of letters and digits", found=self.mark)
-        taken = {name.lower() for name in (*LAS_DIMENSIONS, HEIGHT, *self._created)}
+        taken = {
+            name.lower() for name in (*LAS_DIMENSIONS, _HEIGHT, *(d.name for d in self._results))
+        }
         if self.mark.lower() in taken:
             raise self._mark_exists(self.mark)
         codes = [code for code, _ in self.model.classes]
@@ -181,7 +192,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         """Return the dimensions that the points must have."""
         names = [*self.model.required_dimensions]
         if self.vegetation_heights or self.given_ground:
-            names.append(HEIGHT)
+            names.append(_HEIGHT)
         return list(dict.fromkeys(names))
 
     def _mark_exists(self, name: str) -> OptionError:
@@ -189,17 +200,21 @@ class ApplyModel(Stage, settings=PredictionOptions):
         what = "option 'mark' must name a new dimension"
         return OptionError(what, found=name, cure="Take a name that no dimension has")
 
-    def creates(self) -> dict[str, str]:
-        """Return the dimensions that are written, with their PDAL types."""
-        return self._created | ({self.mark: "uint8_t"} if self.mark else {})
+    def written_dimensions(self) -> Sequence[Dimension]:
+        """Return the dimensions that are written."""
+        mark = Dimension(self.mark, "uint8_t", "1", "1 for points inside `where`, else 0")
+        return [*self._results, *([mark] if self.mark else [])]
 
     @property
-    def _created(self) -> dict[str, str]:
+    def _results(self) -> list[Dimension]:
         """Return the dimensions that are written, without `mark`."""
-        more = [name for name in ("Margin", "Variance") if self.options[name.lower()]]
-        if self.probabilities:
-            more += [f"Probability_{code}" for code, _ in self.model.classes]
-        return {"Classification": "uint8_t", **dict.fromkeys(["Reliability", *more], "float")}
+        codes = [code for code, _ in self.model.classes] if self.probabilities else []
+        return [
+            *(CLASSIFICATION, RELIABILITY),
+            *([MARGIN] if self.options["margin"] else []),
+            *([VARIANCE] if self.variance else []),
+            *map(probability, codes),
+        ]
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
@@ -240,8 +255,10 @@ class ApplyModel(Stage, settings=PredictionOptions):
         }
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
         ground = self._may_be_ground(points) if self.given_ground else None
-        slope = median_slope(points.xyz, points.dimension(HEIGHT)) if HEIGHT in points.arrays else 0
-        points.keep_only([*dimensions, *self.creates(), HEIGHT])
+        slope = (
+            median_slope(points.xyz, points.dimension(_HEIGHT)) if _HEIGHT in points.arrays else 0
+        )
+        points.keep_only([*dimensions, *self.creates(), _HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             prediction = self.model.predict(
                 points.take_xyz(),
@@ -257,11 +274,11 @@ class ApplyModel(Stage, settings=PredictionOptions):
         rejected[prediction.unsure] = True
         codes = prediction.classification
         if self.vegetation_heights:
-            by_height(codes, wanted & ~rejected, points.dimension(HEIGHT), self.vegetation_heights)
+            by_height(codes, wanted & ~rejected, points.dimension(_HEIGHT), self.vegetation_heights)
             prediction.report.figures["classes"] = class_counts(codes[wanted])
-        if HEIGHT in points.arrays:
+        if _HEIGHT in points.arrays:
             leaves = wanted & np.isin(codes, (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION))
-            leaf_heights = points.dimension(HEIGHT)[leaves]
+            leaf_heights = points.dimension(_HEIGHT)[leaves]
             doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical)
             points.report.warnings += [doubt] if doubt else []
         values = self._columns(points, prediction)
@@ -284,8 +301,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
             values |= {f"Probability_{code}": column for code, column in columns}
         if self.compact:
             values = {name: _round(column, _STEPS) for name, column in values.items()}
-            if HEIGHT in points.arrays:
-                values[HEIGHT] = _round(points.arrays[HEIGHT], _HEIGHT_STEPS)
+            if _HEIGHT in points.arrays:
+                values[_HEIGHT] = _round(points.arrays[_HEIGHT], _HEIGHT_STEPS)
         if points.mask is not None:
             for name, column in values.items():
                 values[name] = np.where(points.mask, column, points.arrays[name])
@@ -295,7 +312,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         """Return which points (n,) are near enough to the ground that is given."""
         if "Ground" in points.arrays:
             return np.asarray(points.arrays["Ground"]) > 0
-        return np.abs(points.dimension(HEIGHT)) <= _TOLERANCE_M
+        return np.abs(points.dimension(_HEIGHT)) <= _TOLERANCE_M
 
 
 def _round(values: NDArray, steps: int) -> NDArray:

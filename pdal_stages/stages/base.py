@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.dimensions import CLASSIFICATION, Dimension
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
 from ..base.units import named_unit
@@ -232,9 +233,13 @@ class Stage(ABC):
         """Return the dimensions that the points must have, beyond X, Y and Z."""
         return []
 
+    def written_dimensions(self) -> Sequence[Dimension]:
+        """Return the dimensions that are written."""
+        return ()
+
     def creates(self) -> dict[str, str]:
-        """Return the dimensions that are written: name -> PDAL type, such as ``uint8_t``."""
-        return {}
+        """Return the PDAL types of :meth:`written_dimensions`, such as ``uint8_t``, by name."""
+        return {dimension.name: dimension.type for dimension in self.written_dimensions()}
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
@@ -355,9 +360,9 @@ class ClassStage(Stage):
         ignores = earlier.written_classes() & set(ignored.codes)
         return bool(ignores) or not written.isdisjoint(name.lower() for name in read)
 
-    def creates(self) -> dict[str, str]:
-        """Return the dimensions that are written, with their PDAL types."""
-        return {"Classification": "uint8_t"}
+    def written_dimensions(self) -> Sequence[Dimension]:
+        """Return the dimensions that are written."""
+        return (CLASSIFICATION,)
 
 
 class Blocks(NamedTuple):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.dimensions import OBJECT_ID, Dimension
 from ..base.errors import StageError
 from ..objects.cells import (
     CLASSES,
@@ -121,9 +122,9 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
         """Return the dimensions that the points must have."""
         return ["Classification"]
 
-    def creates(self) -> dict[str, str]:
-        """Return the dimensions that are written, with their PDAL types."""
-        return {"ObjectID": "uint64_t"}
+    def written_dimensions(self) -> Sequence[Dimension]:
+        """Return the dimensions that are written."""
+        return (OBJECT_ID,)
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""

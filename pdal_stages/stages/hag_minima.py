@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.dimensions import HEIGHT, Dimension
 from ..terrain.minima import check_sizes, hag_minima, terrain_reach
 from .base import HEIGHTS_OUTSIDE, Stage, StageContext
 from .options import Selection, ignore_option, option
@@ -39,9 +40,9 @@ class HagMinima(Stage):
         """Refuse options that contradict each other."""
         check_sizes(self.cell, self.resolution)
 
-    def creates(self) -> dict[str, str]:
-        """Return the dimensions that are written, with their PDAL types."""
-        return {"HeightAboveGround": "float"}
+    def written_dimensions(self) -> Sequence[Dimension]:
+        """Return the dimensions that are written."""
+        return (HEIGHT,)
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import TERRAIN
+from ..base.dimensions import GROUND, HEIGHT, SLOPE, Dimension, is_height, opening
 from ..base.errors import NoTerrainError
 from ..terrain.ground_blocks import (
     BLOCK_SIDE,
@@ -17,7 +18,6 @@ from ..terrain.ground_blocks import (
     reduced_points,
 )
 from ..terrain.heights import filtered_ground
-from ..terrain.openings import opening_names
 from ..terrain.smrf import FilterOptions
 from .base import HEIGHTS_OUTSIDE, Blocks, FarReaching, StageContext, inside_block
 from .options import Selection, ignore_option, option
@@ -89,14 +89,10 @@ class HagMorphological(FarReaching):
             **{name: self.options[name] for name in _FILTER}, slope_too=self.terrain_slope
         )
 
-    def creates(self) -> dict[str, str]:
-        """Return the dimensions that are written, with their PDAL types."""
-        return {
-            "HeightAboveGround": "float",
-            **({"Ground": "uint8_t"} if self.ground else {}),
-            **({"Slope": "float"} if self.terrain_slope else {}),
-            **dict.fromkeys(opening_names(self.openings), "float"),
-        }
+    def written_dimensions(self) -> Sequence[Dimension]:
+        """Return the dimensions that are written."""
+        ground, slope = [GROUND] if self.ground else [], [SLOPE] if self.terrain_slope else []
+        return [HEIGHT, *ground, *slope, *map(opening, self.openings)]
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
@@ -159,7 +155,7 @@ class HagMorphological(FarReaching):
         out = {}
         for name in self.creates():
             values = columns.pop(name)
-            if name.startswith("HeightAbove") and points.units.vertical != 1.0:
+            if is_height(name) and points.units.vertical != 1.0:
                 values = values / points.units.vertical
             # As PDAL will have it; a copy more of each would be the most that this stage holds.
             out[name] = values.astype(points.arrays[name].dtype, copy=False)

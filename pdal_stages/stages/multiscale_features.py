@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -10,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.checks import strict_json
+from ..base.dimensions import Dimension
 from ..base.errors import OptionError
 from ..base.files import JSON, Output, write_whole
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS
-from ..features.registry import ALGORITHM_VERSION
+from ..features.registry import ALGORITHM_VERSION, BY_NAME, features_of
 from .base import Stage, StageContext
 from .options import Selection, ignore_option, option
 from .points import Points
@@ -98,9 +100,14 @@ class MultiscaleFeatures(Stage):
             return []
         return [Output(self.bins, "bins", JSON)]
 
-    def creates(self) -> dict[str, str]:
-        """Return the dimensions that are written, with their PDAL types."""
-        return dict.fromkeys(self.columns, "float")
+    def written_dimensions(self) -> Sequence[Dimension]:
+        """Return the dimensions that are written, lengths in meters."""
+        named = features_of(self.plan.neighborhoods)
+        features = [BY_NAME[named[name][1]] for name in self.columns]
+        return [
+            Dimension(name, "float", feature.unit, feature.definition)
+            for name, feature in zip(self.columns, features, strict=True)
+        ]
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""

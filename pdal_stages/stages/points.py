@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
+from ..base.dimensions import is_height
 from ..base.errors import DimensionError, OptionError, StageError
 from ..base.memory import release_pages
 from ..base.messages import Report, shorten
@@ -48,8 +49,6 @@ LAS_DIMENSIONS = (
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 #: How far rounding may take a share beyond 0 or 1.
 _SHARE_ROUNDING = 1e-5
-#: Prefix of dimensions that are lengths upward, as Z is, and have its unit.
-_HEIGHTS = "HeightAbove"
 
 
 @dataclass(eq=False)
@@ -185,7 +184,7 @@ class Points:
         return self.arrays[name]
 
     def dimension(self, name: str, *, meters: bool = True) -> NDArray:
-        """Return the values (n,) of a dimension; lengths upward are converted to meters.
+        """Return the values (n,) of a dimension; heights in the unit of Z are converted to meters.
 
         Raises
         ------
@@ -195,7 +194,7 @@ class Points:
         if name == "Classification":
             return self.class_codes
         values = self._array(name)
-        if meters and (name == "Z" or name.startswith(_HEIGHTS)) and self.units.vertical != 1.0:
+        if meters and is_height(name) and self.units.vertical != 1.0:
             return values * self.units.vertical
         return values
 

@@ -9,13 +9,13 @@ when a file is loaded, and training does not store them.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..base.dimensions import opening_width
 from ..base.errors import ModelError, StageError
 from ..base.las import number_type
 from .base import WHOLE_CLOUD
@@ -60,8 +60,6 @@ PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
 #: Options on a stage's place in a pipeline, on how it is run and on the units of the points at
 #: hand; they do not change what it computes.
 _NOT_STORED = (*PDAL_OWN, "threads", "horizontal_unit", "vertical_unit")
-#: Prefix of the names of heights above openings; the width follows.
-_OPENING = "HeightAboveOpening_"
 #: Most characters of preprocessing as JSON; more is an attack on the reader's time.
 _MAX_CHARACTERS = 2000
 
@@ -164,8 +162,7 @@ def with_given_ground(preparation: Iterable[Mapping[str, Any]]) -> list[dict[str
 def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
     """Return the stage that creates these dimensions, as far as they are heights."""
     wanted = list(names)
-    matches = (re.fullmatch(rf"{_OPENING}(\d+(?:_\d+)?)", name) for name in wanted)
-    openings = [_number(float(match[1].replace("_", "."))) for match in matches if match]
+    openings = [_number(width) for width in map(opening_width, wanted) if width is not None]
     if not openings and "Ground" not in wanted:
         return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in wanted else []
     stage: dict[str, Any] = {"type": "filters.hag_morphological"}

@@ -34,11 +34,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base.dimensions import opening
 from ..base.grid import GridWindow
 from ..base.threads import map_blocks
 from .cells import HIGHEST, HOLE, columns, usable
 from .ground_blocks import GroundCells
-from .openings import FILL_RINGS, fill_holes, opening_names, openings_of
+from .openings import FILL_RINGS, fill_holes, openings_of
 from .pieces import patches
 from .smrf import (
     FAR,
@@ -149,7 +150,7 @@ def _heights(
         "HeightAboveGround": np.zeros(count),
         "Ground": np.zeros(count, np.uint8),
         **({"Slope": np.zeros(count)} if options.slope_too else {}),
-        **{name: np.zeros(count, np.float32) for name in opening_names(options.openings)},
+        **{opening(width).name: np.zeros(count, np.float32) for width in options.openings},
     }
     counts["without_terrain"] = 0
     if ground is not None:
@@ -247,9 +248,9 @@ def _measure(
     if options.slope_too:
         out["Slope"] = np.degrees(np.arctan(gradient))
     planes[:] = 0.0
-    for name, radius in zip(opening_names(options.openings), options.requested_radii, strict=True):
+    for width, radius in zip(options.openings, options.requested_radii, strict=True):
         opened = raster.opened[radius]
         planes[..., 0] = np.where(np.isfinite(opened), opened, np.nan)
         values, _ = above(planes)
-        out[name] = np.where(np.isnan(values), height, values).astype(np.float32)
+        out[opening(width).name] = np.where(np.isnan(values), height, values).astype(np.float32)
     return out

@@ -10,7 +10,7 @@ logarithm of its radius.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -180,8 +180,3 @@ def objects_of(
             floor[lowered] = opened[lowered]
             before = opened
     return objects, floor, openings
-
-
-def opening_names(windows: Sequence[float]) -> list[str]:
-    """Name the dimensions of windows: ``HeightAboveOpening_5``; a decimal point becomes ``_``."""
-    return [f"HeightAboveOpening_{window:g}".replace(".", "_") for window in windows]
