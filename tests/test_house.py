@@ -77,6 +77,28 @@ def test_no_import_upward_by_name(path):
                 ), f"line {node.lineno}: {room} names {other}"
 
 
+def imported_modules(path: Path) -> set[str]:
+    """Return the modules of the package that one imports, anywhere in it and for types alone."""
+    package = path.relative_to(ROOT.parent).parts[:-1]
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            above = package[: len(package) - node.level + 1]
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
+    return names
+
+
+def test_no_circle_of_modules():
+    """No module needs another that needs it; packages, which only name what is in them, aside."""
+    paths = [path for path in ROOT.rglob("*.py") if path.name != "__init__.py"]
+    named = {".".join(p.relative_to(ROOT.parent).with_suffix("").parts): p for p in paths}
+    needed = {name: imported_modules(path) & named.keys() - {name} for name, path in named.items()}
+    while free := {name for name, names in needed.items() if not names & needed.keys()}:
+        needed = {name: names for name, names in needed.items() if name not in free}
+    assert not needed
+
+
 def test_one_class_one_name():
     """No two public classes of the package have one name, so that a name means one thing in any room."""
     doors: dict[str, str] = {}

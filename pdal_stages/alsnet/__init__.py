@@ -1,18 +1,27 @@
 """alsNet: PointNet++ for airborne laser scans [WM19], a kind of classifier of model files."""
 
-from ..classifier.interface import register_kind
+from ..classifier.interface import KINDS
 
 
-def _network():
-    from .classifier import AlsNet
+class _NetworkKind:
+    """See :class:`..classifier.interface.EstimatorKind`."""
 
-    return AlsNet
+    @property
+    def rules(self):
+        from .classifier import AlsNet
+
+        return AlsNet.rules
+
+    @property
+    def trainer(self):
+        from . import training
+
+        return training
+
+    def from_file(self, entry, arrays, codes):
+        from .classifier import AlsNet
+
+        return AlsNet.from_file(entry, arrays, codes)
 
 
-def _network_trainer():
-    from . import training
-
-    return training
-
-
-register_kind("alsnet", _network, _network_trainer)
+KINDS["alsnet"] = _NetworkKind()

@@ -91,8 +91,8 @@ class NetworkTraining:
         self.threads = resolve_threads(options.threads)
         self.device = torch_network.resolve_device(self.options.device)
         names, network = inputs(options), self.options
-        start_model = None if network.start_from is None else _load_start(network, names)
-        start_from = None if start_model is None else start_model.algorithm
+        start = None if network.start_from is None else _load_start(network, names)
+        start_from = None if start is None else start[1]
         self.data = data = TrainingData(clouds, options, names, start_from)
         count = data.count_trained()
         self.selected = select_batches(
@@ -100,8 +100,8 @@ class NetworkTraining:
         )
         self.held_batches = cover(data.batches, data.held_labels >= 0)
         weights = initial_weights(network.configuration, len(names), data.n_classes, self.seed)
-        if start_model is not None:
-            weights = _transfer(start_model, weights, data.labeled.classes)
+        if start is not None:
+            weights = _transfer(*start, weights, data.labeled.classes)
         shape = network.configuration, len(names), data.n_classes
         self.network = torch_network.Network(*shape).load(weights).to(self.device)
         self.optimizer = self.torch.optim.Adam(self.network.parameters(), lr=network.learning_rate)
@@ -254,8 +254,8 @@ def _score(row: dict[str, Any]) -> float:
     return float(row["mean_f1"] or 0.0)
 
 
-def _load_start(options: NetworkOptions, names: tuple[str, ...]) -> Model:
-    """Return the model whose network training starts from; ModelError where that does not fit."""
+def _load_start(options: NetworkOptions, names: tuple[str, ...]) -> tuple[Model, AlsNet]:
+    """Return the model and network that training starts from; ModelError where they do not fit."""
     path = str(options.start_from)
     model = load_model(path)
     net, wanted = model.algorithm, options.configuration
@@ -269,12 +269,12 @@ def _load_start(options: NetworkOptions, names: tuple[str, ...]) -> Model:
             found=f"configuration {net.configuration.name}, inputs {', '.join(net.inputs)}",
             cure="Use its configuration and inputs: options configuration, coordinates, dimensions",
         )
-    return model
+    return model, net
 
 
-def _transfer(source: Model, start: Weights, classes: ClassMap) -> Weights:
+def _transfer(source: Model, network: AlsNet, start: Weights, classes: ClassMap) -> Weights:
     """Return the source's weights, of the last layer only for classes that both have [WM19 3]."""
-    weights, codes = source.algorithm.weights, source.codes.tolist()
+    weights, codes = network.weights, source.codes.tolist()
     scores = start["scores"].copy()
     for k, code in enumerate(classes.codes):
         if code in codes:

@@ -1,7 +1,9 @@
-"""Hashes of points that follow from their values alone: splitmix64 (Steele, Lea, Flood 2014)."""
+"""Hashes of points by their values alone: splitmix64 (Steele, Lea, Flood 2014); fingerprints."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterable
 from typing import Any
 
@@ -40,3 +42,8 @@ def hash_rows(columns: Iterable[npt.ArrayLike], seed: int) -> npt.NDArray[np.uin
             value = finalize((value ^ bits) + GOLDEN)
         out[batch] = value
     return out
+
+
+def fingerprint(*parts: Any) -> str:
+    """Return a digest of JSON-able values."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]

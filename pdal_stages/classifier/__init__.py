@@ -1,18 +1,13 @@
 """Classifiers of points: the model file, the random forest, auto-context passes, and training."""
 
-from .interface import FOREST, register_kind
+from .feature_kind import FeatureKind
+from .interface import FOREST, KINDS
 
 
 def _forest():
-    from .feature_forest import FeatureForest
+    from .random_forest import Forest
 
-    return FeatureForest
-
-
-def _forest_trainer():
-    from . import train_forest
-
-    return train_forest
+    return Forest
 
 
-register_kind(FOREST, _forest, _forest_trainer)
+KINDS[FOREST] = FeatureKind(FOREST, _forest)

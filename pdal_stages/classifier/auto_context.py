@@ -23,8 +23,8 @@ from ..base.threads import map_blocks
 from ..features import FeaturePlan
 from ..features.engine import FeatureBlock, Run
 from .context_features import HEIGHT, CellContext, Context, count_shares, rows_needed
-from .feature_forest import CloudFeatures, FeatureForest, Features
-from .interface import Block, InputPlan, PredictRequest, weigh
+from .feature_forest import CloudFeatures, FeatureForest, FeatureReader, Features
+from .interface import Block, Estimator, InputPlan, PointEstimator, PredictRequest, weigh
 
 #: Points of a band at most, but for a band of one strip: the features of a few bands are held (not
 #: tuned; results do not depend on it).
@@ -37,13 +37,14 @@ _ANY_WIDTH_M = 8.0
 _SHARE_OF_BLOCKS = 0.5
 
 
-def plan_of(passes: Sequence[Any]) -> FeaturePlan | InputPlan:
+def plan_of(passes: Sequence[Estimator]) -> FeaturePlan | InputPlan:
     """Return the inputs of all passes; each later pass adds its reach to the halo."""
     plans = [each.plan for each in passes]
     if len(plans) == 1:
         return plans[0]
     halo_m = plans[0].halo_m
     for later in passes[1:]:
+        assert later.context is not None
         halo_m = max(later.plan.halo_m, halo_m + later.context.reach)
     return InputPlan(
         tuple(dict.fromkeys(name for plan in plans for name in plan.names)),
@@ -85,7 +86,7 @@ class FoldForests:
 class WeightedPass(NamedTuple):
     """A pass, and the factors of its probabilities."""
 
-    classifier: Any  #: see ``PassClassifier``
+    classifier: Estimator | FeatureReader
     codes: Sequence[int]  #: its classes
     #: (classes,) what the probabilities are multiplied by before they are handed on
     factors: npt.NDArray[np.float64] | None = None
@@ -94,7 +95,7 @@ class WeightedPass(NamedTuple):
 def classify(passes: Sequence[WeightedPass], request: PredictRequest) -> Iterator[Block]:
     """Yield the weighted probabilities of the last pass for all points wanted, block by block."""
     first = passes[0].classifier
-    if first.features is None:  # it reads the points themselves, and is the only pass
+    if isinstance(first, PointEstimator):  # the only pass
         yield from first.predict(request)
         return
     for rows, probabilities in PassRun(passes, request).blocks():
@@ -133,19 +134,21 @@ class PassRun:
         context: Context | None = None,
     ) -> None:
         self._passes, self._request = passes, request
-        read = [each.classifier.features for each in passes]
-        #: What each step reads of the pass before; the last step may be the context alone.
-        self._contexts = [None, *(each.classifier.context for each in passes[1:])]
+        readers = [each.classifier for each in passes if isinstance(each.classifier, FeatureReader)]
+        read: list[Features | None] = [reader.features for reader in readers]
+        contexts = [reader.context for reader in readers[1:] if reader.context is not None]
         if context is not None:
-            self._contexts.append(context)
+            contexts.append(context)
             read.append(None)
+        #: What each step reads of the pass before; the last step may be the context alone.
+        self._contexts: list[Context | None] = [None, *contexts]
         self._last = len(read) - 1
         wanted = [request.rows]  # of each step
-        for later in self._contexts[:0:-1]:
+        for later in reversed(contexts):
             wanted.insert(0, rows_needed(request.xyz, wanted[0], later))
         self._wanted = [_mask(rows, len(request.xyz)) for rows in wanted]
         # Where no pass reads strips beside its own any width will do.
-        width = max((each.strip for each in self._contexts[1:]), default=0.0) or _ANY_WIDTH_M
+        width = max((each.strip for each in contexts), default=0.0) or _ANY_WIDTH_M
         self._strips = Strips(request.xyz, wanted[0], width)
         n = len(self._strips)
         #: (n, classes) of each step but the last, in the order of the strips
@@ -266,6 +269,7 @@ class _StepOnBand:
         if self.weighted_pass is None:
             return read
         classifier, _, factors = self.weighted_pass
+        assert isinstance(classifier, FeatureReader)
         p = weigh(classifier.probabilities(read, rows), factors)
         return count_shares(p) if self.hands_on else p
 

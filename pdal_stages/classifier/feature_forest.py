@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +14,8 @@ from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.engine import FeatureBlock, Run
 from .context_features import OWN, Context
 from .input_dimensions import add_return_features, take_dimensions
-from .interface import FOREST, REFINED_FOREST, ArrayRule, PredictRequest
-from .random_forest import Forest
+from .interface import FOREST, REFINED_FOREST, Estimator, PredictRequest
+from .learner import Learner
 
 #: Blocks of features get so many megabytes at least, whatever the request says (not tuned).
 _LEAST_MB = 16.0
@@ -185,21 +185,46 @@ class Blend:
         return out
 
 
+@runtime_checkable
+class FeatureReader(Protocol):
+    """What reads features of the points and context of the pass before."""
+
+    @property
+    def features(self) -> Features:
+        """The features that it reads."""
+
+    @property
+    def context(self) -> Context | None:
+        """What it reads of the pass before; None of the first pass."""
+
+    def probabilities(
+        self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """Return probabilities (b, classes) from features and context (b, inputs) at `rows`."""
+
+
+@runtime_checkable
+class FeatureEstimator(FeatureReader, Estimator, Protocol):
+    """An estimator that reads features and context."""
+
+    def classes_before(self, codes: Sequence[int]) -> list[int]:
+        """Return the classes of the pass before; `codes` are its own."""
+
+
 @dataclass(frozen=True, eq=False)
 class FeatureForest:
-    """A forest and what it reads."""
+    """A forest, or another learner on features, and what it reads."""
 
     features: Features
-    forest: Forest
+    forest: Learner
     context: Context | None = None  #: read of the pass before; its columns follow the features
     blend: Blend | None = None  #: of a forest on top of a base
-
-    rules: ClassVar[Mapping[str, ArrayRule]] = Forest.rules
+    kind: str = FOREST  #: of the learner
 
     @property
     def name(self) -> str:
         """The kind, as a manifest has it."""
-        return FOREST if self.blend is None else REFINED_FOREST
+        return self.kind if self.blend is None else REFINED_FOREST
 
     @property
     def plan(self) -> FeaturePlan:
@@ -208,7 +233,11 @@ class FeatureForest:
 
     @classmethod
     def from_file(
-        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+        cls,
+        entry: Mapping[str, Any],
+        arrays: Mapping[str, npt.NDArray[Any]],
+        codes: Sequence[int],
+        learner: type[Learner],
     ) -> FeatureForest:
         """Return the forest that a pass of a manifest describes; ModelError for contradictions."""
         context = Context(tuple(entry["context"])) if entry["context"] else None
@@ -230,7 +259,9 @@ class FeatureForest:
         if context is not None:
             context.check_segments(before, entry["dimensions"])
         features = Features.from_dict(entry, names[:count])
-        return cls(features, Forest.from_arrays(arrays, len(names), len(labeled)), context, blend)
+        forest = learner.from_arrays(arrays, len(names), len(labeled))
+        kind = FOREST if blend is not None else entry["algorithm"]
+        return cls(features, forest, context, blend, kind)
 
     def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
         """Return what a manifest says of it beside its arrays."""
@@ -243,7 +274,7 @@ class FeatureForest:
             **self.features.to_dict(),
         }
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
         """Return the arrays that a model file stores."""
         return self.forest.arrays()
 

@@ -1,23 +1,29 @@
 """Interface of all kinds of classifiers: their request and results, and how they are registered.
 
 Imports only go downward, so this room cannot import the network or the stages of pipelines. Such a
-room registers itself in its ``__init__``, which the package's own ``__init__`` imports. What it
-registers are functions that import the implementation when it is first needed, so that a forest is
+room registers itself in its ``__init__``, which the package's own ``__init__`` imports; another
+package by an entry point. A kind imports its modules when it is first needed, so that a forest is
 applied without the network's modules.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import cache
+from importlib import metadata
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.messages import Report
-from ..features.point_grid import CellGrid
+
+if TYPE_CHECKING:  # they take long to import
+    from ..features.plan import FeaturePlan
+    from ..features.point_grid import CellGrid
+    from .context_features import Context
 
 #: The kind of a forest on features.
 FOREST = "random_forest"
@@ -83,79 +89,140 @@ def weigh(
     return p
 
 
-_kinds: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {}
-_preprocessing: list[Callable[[], Any]] = []
+class Estimator(Protocol):
+    """One pass of a model: what a forest, a refined forest, a network and others fulfil.
 
-
-def register_kind(name: str, classifier: Callable[[], Any], trainer: Callable[[], Any]) -> None:
-    """Register a kind of classifier by the name that manifests and the option `algorithm` use.
-
-    Its classifier is a class, and an object of it one pass of a model, with
-
-    - ``rules``: name -> :class:`ArrayRule` of the arrays that the kind stores in a model file; a
-      name that ends in ``*`` stands for many;
-    - ``name``: the kind, as a manifest has it;
-    - ``plan``: the inputs that it reads of the points, a ``FeaturePlan`` or :class:`InputPlan`;
-    - ``features``: the features that it reads; None for a kind that reads the points themselves;
-    - ``context``: the context that it reads of the pass before, or None;
-    - ``from_file(entry, arrays, codes)``: the classifier that a pass of a manifest describes, with
-      classes `codes`; ModelError where the entry contradicts itself;
-    - ``to_file(codes)`` and ``arrays()``: what a model file stores of it.
-
-    A kind that reads features and context has ``probabilities(values, rows)``: (b, classes) from
-    features and context (b, inputs) at `rows`, and ``classes_before(codes)``: the classes of the
-    pass before, where its own are `codes`. One that reads the points themselves can only be the
-    first pass, and has ``predict(request)``, which yields a :class:`Block` after the other, with
-    each row wanted once.
-
-    Its trainer is a module with
-
-    - ``optional_inputs``: dimensions that training uses where the points have them, each with the
-      dimensions that it is computed from;
-    - ``own_options(options)``: the checked options that only this kind has, or None;
-    - ``inputs(options)``: the dimensions that the classifier will read;
-    - ``train(clouds, options, progress)``: a ``Model``, trained on clouds that are prepared.
+    One that reads features and context is a :class:`.feature_forest.FeatureEstimator`; one that
+    reads the points themselves a :class:`PointEstimator`.
     """
-    _kinds[name] = classifier, trainer
+
+    @property
+    def name(self) -> str:
+        """The kind, as a manifest has it."""
+
+    @property
+    def plan(self) -> FeaturePlan | InputPlan:
+        """The inputs that it reads of the points."""
+
+    @property
+    def context(self) -> Context | None:
+        """What it reads of the pass before."""
+
+    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return the arrays that a model file stores."""
+
+    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+        """Return what a manifest says of it beside its arrays, where its classes are `codes`."""
 
 
-def register_preprocessing(load: Callable[[], Any]) -> None:
-    """Register the module that knows the stages which compute a model's dimensions.
+@runtime_checkable
+class PointEstimator(Estimator, Protocol):
+    """An estimator that reads the points themselves: it is the only pass of its model."""
 
-    It has
+    def predict(self, request: PredictRequest) -> Iterator[Block]:
+        """Yield blocks of probabilities, with each row wanted once."""
 
-    - ``check(preparation)``: the stages in one spelling; ModelError for one that no model may have;
-    - ``algorithm_versions(preparation)``: the version of each stage's algorithm in this release;
-    - ``preparation_of(names)``: the stages that compute these dimensions, as far as they are
-      heights;
-    - ``made_of_coordinates(preparation, xyz, usable, threads, classes)``: the dimensions (n,) that
-      the stages compute from coordinates (n, 3) in meters.
-    """
+
+class Trainer(Protocol):
+    """What trains one kind; `options` are :class:`.training_options.TrainingOptions`."""
+
+    @property
+    def optional_inputs(self) -> Mapping[str, Sequence[str]]:
+        """Dimensions used where the points have them, each with those that it is computed from."""
+
+    def own_options(self, options: Any) -> Any:
+        """Return the checked options that only this kind has, or None."""
+
+    def inputs(self, options: Any) -> tuple[str, ...]:
+        """Return the dimensions that the estimator will read."""
+
+    def train(self, clouds: Any, options: Any, progress: bool) -> Any:
+        """Return a ``Model``, trained on clouds that are prepared."""
+
+
+class EstimatorKind(Protocol):
+    """A kind of estimator. Its modules are imported when it is used."""
+
+    @property
+    def rules(self) -> Mapping[str, ArrayRule]:
+        """The arrays of a model file; a name that ends in ``*`` stands for many."""
+
+    @property
+    def trainer(self) -> Trainer:
+        """What trains it."""
+
+    def from_file(
+        self, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+    ) -> Estimator:
+        """Return the estimator that a pass of a manifest describes, with classes `codes`.
+
+        ModelError where the entry contradicts itself.
+        """
+
+
+class Preprocessing(Protocol):
+    """What knows the stages that compute a model's dimensions (``preparation``)."""
+
+    def check(self, preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Return the stages in one spelling; ModelError for one that no model may have."""
+
+    def algorithm_versions(self, preparation: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+        """Return the version of each stage's algorithm in this release."""
+
+    def preparation_of(self, names: Iterable[str]) -> list[dict[str, Any]]:
+        """Return the stages that compute these dimensions, as far as they are heights."""
+
+    def made_of_coordinates(
+        self,
+        preparation: Sequence[Mapping[str, Any]],
+        xyz: npt.NDArray[np.float64],
+        usable: npt.NDArray[np.bool_] | None = None,
+        threads: int | None = None,
+        classes: npt.NDArray[np.uint8] | None = None,
+    ) -> dict[str, npt.NDArray[Any]]:
+        """Return the dimensions (n,) that the stages compute from coordinates (n, 3) in meters."""
+
+
+#: The kinds by the name that manifests and the option ``algorithm`` use.
+KINDS: dict[str, EstimatorKind] = {}
+#: Entry points by which other packages register kinds: name -> ``module:KIND``.
+ENTRY_POINTS = "pdal_stages.kinds"
+_preprocessing: list[Callable[[], Preprocessing]] = []
+
+
+def register_preprocessing(load: Callable[[], Preprocessing]) -> None:
+    """Register what knows the stages, a room above this one."""
     _preprocessing.append(load)
 
 
-def kinds() -> tuple[str, ...]:
-    """Return the names of the kinds that can be trained."""
-    return tuple(_kinds)
+def kinds() -> Mapping[str, EstimatorKind]:
+    """Return all kinds that can be trained, those of other packages included."""
+    return {**_kinds_of_other_packages(), **KINDS}
 
 
-def classifier_of(name: str) -> Any:
-    """Return the class of a kind; ModelError for one that this release does not have."""
+@cache
+def _kinds_of_other_packages() -> dict[str, EstimatorKind]:
+    entries = metadata.entry_points(group=ENTRY_POINTS)
+    return {entry.name: entry.load() for entry in entries if entry.name not in KINDS}
+
+
+def classifier_of(name: str) -> EstimatorKind:
+    """Return a kind; ModelError for one that this release does not have."""
     kind = FOREST if name == REFINED_FOREST else name
-    if kind not in _kinds:
+    if (known := KINDS.get(kind) or kinds().get(kind)) is None:
         raise ModelError(
             "the model uses an algorithm this release does not know",
             found=repr(name)[:60],
             cure="Update pdal-stages",
         )
-    return _kinds[kind][0]()
+    return known
 
 
-def trainer_of(name: str) -> Any:
-    """Return the module that trains a kind, one of :func:`kinds`."""
-    return _kinds[name][1]()
+def trainer_of(name: str) -> Trainer:
+    """Return what trains a kind, one of :func:`kinds`."""
+    return (KINDS.get(name) or kinds()[name]).trainer
 
 
-def preprocessing() -> Any:
-    """Return the module that was registered."""
+def preprocessing() -> Preprocessing:
+    """Return what was registered."""
     return _preprocessing[-1]()

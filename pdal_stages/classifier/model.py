@@ -20,8 +20,16 @@ from ..features.registry import ALGORITHM_VERSION
 from ..features.voxels import check_side, represent
 from . import model_description, model_file
 from .auto_context import WeightedPass, classify, plan_of
+from .feature_forest import FeatureEstimator
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
-from .interface import InputPlan, PredictRequest, classifier_of, preprocessing
+from .interface import (
+    Estimator,
+    InputPlan,
+    PointEstimator,
+    PredictRequest,
+    classifier_of,
+    preprocessing,
+)
 from .prediction import (
     PointRoles,
     Prediction,
@@ -44,13 +52,13 @@ class Model:
     """A trained classifier. Make one with :func:`train` or :func:`load_model`."""
 
     #: the classifiers; each but the first reads the probabilities of the one before
-    passes: tuple[Any, ...]
+    passes: tuple[Estimator, ...]
     classes: list[tuple[int, str]]  #: code and name, in the order of the columns of probabilities
     #: the rest of the manifest: how it was trained, scores, by pass its importances
     info: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def algorithm(self) -> Any:
+    def algorithm(self) -> Estimator:
         """The last pass, whose probabilities are the model's."""
         return self.passes[-1]
 
@@ -111,7 +119,7 @@ class Model:
     @property
     def gives_variance(self) -> bool:
         """True for a network, which sees each point in several batches."""
-        return self.passes[0].features is None
+        return isinstance(self.passes[0], PointEstimator)
 
     @property
     def algorithm_versions(self) -> dict[str, int]:
@@ -210,7 +218,7 @@ class Model:
             See :class:`PredictionOptions`.
         """
         how = PredictionOptions(**options)
-        if how.variance and self.passes[0].features is not None:
+        if how.variance and not self.gives_variance:
             raise OptionError("only a network gives a variance", cure="Ask for the margin")
         xyz = check_xyz(xyz)
         roles = PointRoles.check(len(xyz), where, ignore, current, may_be_ground)
@@ -353,7 +361,7 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
     classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
     codes = [code for code, _ in classes]
     check_side(manifest["voxel"])
-    passes: list[Any] = []
+    passes: list[Estimator] = []
     before: list[int] = []
     for number, (entry, of_pass) in enumerate(zip(manifest["passes"], arrays, strict=True)):
         here, codes_here = f"pass {number + 1}", entry.get("codes") or codes
@@ -363,13 +371,20 @@ def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
         for key, length in lengths.items():
             if entry.get(key) is not None and len(entry[key]) != length:
                 raise ModelError(f"{here} must have {length} {key}", found=len(entry[key]))
-        if bool(number) != bool(entry["context"]) or (number and passes[0].features is None):
+        if bool(number) != bool(entry["context"]) or (
+            number and isinstance(passes[0], PointEstimator)
+        ):
             raise ModelError(
                 "the first pass reads no context, each later one does, and none follows a network",
                 found=here,
             )
-        classifier: Any = classifier_of(entry["algorithm"]).from_file(entry, of_pass, codes_here)
-        if number and classifier.classes_before(codes_here) != before:
+        classifier = classifier_of(entry["algorithm"]).from_file(entry, of_pass, codes_here)
+        reads = (
+            classifier.classes_before(codes_here)
+            if isinstance(classifier, FeatureEstimator)
+            else []
+        )
+        if number and reads != before:
             raise ModelError("a pass reads other classes than the one before gives", found=here)
         passes.append(classifier)
         before = codes_here

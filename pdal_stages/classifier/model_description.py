@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 from ..base.messages import one_line
 from .calibration import Calibration
-
-if TYPE_CHECKING:
-    from .model import Model
 
 #: Most surveys that the text names, and most inputs by importance.
 _SURVEYS = 40
@@ -19,7 +16,45 @@ _TOP = 10
 _Rows = list[tuple[str, str]]
 
 
-def text(model: Model) -> str:
+class DescribedModel(Protocol):
+    """What the text reads of a ``Model``."""
+
+    @property
+    def info(self) -> Mapping[str, Any]:
+        """The manifest without its passes."""
+
+    @property
+    def required_dimensions(self) -> Sequence[str]:
+        """Dimensions that a cloud must have."""
+
+    @property
+    def optional_dimensions(self) -> Sequence[str]:
+        """Dimensions that are used where a cloud has them."""
+
+    @property
+    def preparation(self) -> Sequence[Mapping[str, Any]]:
+        """Stages that computed the training's dimensions."""
+
+    @property
+    def voxel(self) -> float:
+        """Side of the voxels in meters."""
+
+    @property
+    def halo_m(self) -> float:
+        """Meters around a tile."""
+
+    @property
+    def outdated(self) -> Sequence[str]:
+        """Warnings about algorithms that have changed."""
+
+    def manifest(self) -> Mapping[str, Any]:
+        """Return the manifest."""
+
+    def importances(self, number: int = -1) -> Mapping[str, float]:
+        """Return the importances of a pass."""
+
+
+def text(model: DescribedModel) -> str:
     """Return a page of text about a model. Names come from its file, so every row is escaped."""
     info = model.info
     rows = [*_measured(info), *_inputs(model), *_passes(model), *_training(model)]
@@ -40,7 +75,7 @@ def _measured(info: Mapping[str, Any]) -> _Rows:
     ]
 
 
-def _inputs(model: Model) -> _Rows:
+def _inputs(model: DescribedModel) -> _Rows:
     """Return dimensions and preprocessing."""
     info, versions = model.info, model.info["algorithms"]
     rows = [("reads", ", ".join(["X, Y, Z", *model.required_dimensions]))]
@@ -55,7 +90,7 @@ def _inputs(model: Model) -> _Rows:
     return rows
 
 
-def _passes(model: Model) -> _Rows:
+def _passes(model: DescribedModel) -> _Rows:
     """Return the size of each classifier, what it reads, and which inputs matter most."""
     rows = []
     for number, entry in enumerate(model.manifest()["passes"]):
@@ -74,7 +109,7 @@ def _passes(model: Model) -> _Rows:
     return rows
 
 
-def _training(model: Model) -> _Rows:
+def _training(model: DescribedModel) -> _Rows:
     """Return what it was trained on and where it holds."""
     info = model.info
     clouds = info["training"]["clouds"]

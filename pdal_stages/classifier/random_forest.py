@@ -116,6 +116,19 @@ class Forest:
         )
 
     @classmethod
+    def fit(
+        cls,
+        values: npt.NDArray[np.float32],
+        label: npt.NDArray[Any],
+        weight: npt.NDArray[np.int64],
+        trees: int | Sequence[int],
+        options: TrainingOptions,
+        progress: Progress | None = None,
+    ) -> tuple[Forest, npt.NDArray[np.float64]]:
+        """Return a forest and its importances; see :func:`grow_forest`."""
+        return grow_forest(values, label, weight, trees, options, progress)
+
+    @classmethod
     def from_arrays(
         cls, arrays: Mapping[str, npt.NDArray[Any]], n_features: int, n_classes: int
     ) -> Forest:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -24,8 +24,8 @@ from .context_features import Context
 from .feature_forest import Blend, CloudFeatures, FeatureForest, Features
 from .input_dimensions import OPTIONAL_DIMENSIONS
 from .interface import PredictRequest, weigh
+from .learner import Learner
 from .model import Model
-from .random_forest import Forest, grow_forest
 from .sampling import BLOCK_M, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
@@ -45,21 +45,36 @@ _STORED = (
     *("vote", "sampling", "scaling"),
 )
 
-optional_inputs = {**{name: (name,) for name in OPTIONAL_DIMENSIONS}, "returns": SOURCES}
 
+@dataclass(frozen=True)
+class FeatureTrainer:
+    """What trains a kind that learns on features; see :class:`.interface.Trainer`."""
 
-def own_options(options: Any) -> None:
-    """Return None: a forest has no options beside ``TrainingOptions``."""
-    if options:
-        raise OptionError("'alsnet' is for the algorithm of that name", found="random_forest")
+    name: str  #: of the kind
+    learner: type[Learner]
 
+    @property
+    def optional_inputs(self) -> Mapping[str, Sequence[str]]:
+        """Dimensions used where the points have them, each with those that it is computed from."""
+        return {**{name: (name,) for name in OPTIONAL_DIMENSIONS}, "returns": SOURCES}
 
-def inputs(options: TrainingOptions) -> tuple[str, ...]:
-    """Return dimensions used as features, by the forest or the model it is built on."""
-    dimensions = feature_plan(options).dimensions
-    if options.base is None:
-        return dimensions
-    return tuple(dict.fromkeys([*dimensions, *options.base.plan.dimensions]))
+    def own_options(self, options: Any) -> None:
+        """Return None: there are no options beside ``TrainingOptions``."""
+        if options:
+            raise OptionError("'alsnet' is for the algorithm of that name", found=self.name)
+
+    def inputs(self, options: TrainingOptions) -> tuple[str, ...]:
+        """Return dimensions used as features, by the forest or the model it is built on."""
+        dimensions = feature_plan(options).dimensions
+        if options.base is None:
+            return dimensions
+        return tuple(dict.fromkeys([*dimensions, *options.base.plan.dimensions]))
+
+    def train(
+        self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool
+    ) -> Model:
+        """Train all passes, see :func:`pdal_stages.classifier.train`."""
+        return ForestTraining(clouds, options, progress, self).model()
 
 
 def fold_trees(trees: int) -> int:
@@ -67,18 +82,18 @@ def fold_trees(trees: int) -> int:
     return max(1, math.ceil(trees * FOLD_TREES))
 
 
-def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool) -> Model:
-    """Train a forest, see :func:`pdal_stages.classifier.train`."""
-    return ForestTraining(clouds, options, progress).model()
-
-
 class ForestTraining:
     """Samples of labeled clouds and what is computed of them."""
 
     def __init__(
-        self, clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: bool
+        self,
+        clouds: Sequence[TrainingCloud],
+        options: TrainingOptions,
+        progress: bool,
+        trainer: FeatureTrainer,
     ) -> None:
         """Draw samples, and compute their features."""
+        self.trainer = trainer
         self.clouds, self.options, self.base = clouds, options, options.base
         self.progress = partial(Progress, enabled=progress)
         self.labeled = label_classes(clouds, options, progress)
@@ -99,7 +114,7 @@ class ForestTraining:
         self.context = Context(tuple(options.context))
         known = self.codes if self.base is None else self.base.codes.tolist()
         if options.passes > 1 or self.base is not None:
-            self.context.check_segments(known, inputs(options))
+            self.context.check_segments(known, trainer.inputs(options))
         self.blend: Blend | None = None
         #: What the first pass reads of the samples.
         self.first = self.values
@@ -215,9 +230,10 @@ class ForestTraining:
         weight: npt.NDArray[np.int64],
         trees: int | Sequence[int],
         bar: Progress,
-    ) -> tuple[Forest, npt.NDArray[np.float64]]:
+    ) -> tuple[Learner, npt.NDArray[np.float64] | None]:
         """Grow a forest on the samples, and return its importances."""
-        return grow_forest(values, self.samples.label, weight, trees, self.growth, bar)
+        label, growth = self.samples.label, self.growth
+        return self.trainer.learner.fit(values, label, weight, trees, growth, bar)
 
     def _without_each(
         self,
@@ -226,7 +242,7 @@ class ForestTraining:
         what: str,
         gap: float = 0.0,
         needed: int = 2,
-    ) -> Iterator[tuple[npt.NDArray[np.int64], Forest]]:
+    ) -> Iterator[tuple[npt.NDArray[np.int64], Learner]]:
         """Yield for each fold the samples held out, and a forest grown without them.
 
         Samples within `gap` meters of the fold are left out as well. OptionError where fewer than
@@ -291,7 +307,7 @@ class ForestTraining:
         true = np.asarray(self.codes)[self.samples.label[rows]]
         self.calibration.add(predicted, true, p.max(axis=1), self.stands_for[rows])
 
-    def _passes(self) -> tuple[list[FeatureForest], list[list[float]]]:
+    def _passes(self) -> tuple[list[FeatureForest], list[list[float] | None]]:
         """Grow one forest after the other; each reads the one before on ground it has not seen."""
         o, samples = self.options, self.samples
         forests, importances = [], []
@@ -314,15 +330,16 @@ class ForestTraining:
                 values = _join_columns(self.values, self._context_of_samples(held_out, folds))
             grid: Sequence[int] = o.trees_grid or (o.trees,)
             with self.progress(grid[-1], f"growing pass {number + 1}", "trees") as bar:
-                forest, shares = self._grow(values, samples.weight, grid, bar)
+                trees = grid[0] if len(grid) == 1 else grid
+                forest, shares = self._grow(values, samples.weight, trees, bar)
             forests.append(self._read_by(number, forest))
-            importances.append(shares.tolist())
+            importances.append(None if shares is None else shares.tolist())
         return forests, importances
 
-    def _read_by(self, number: int, forest: Forest) -> FeatureForest:
+    def _read_by(self, number: int, forest: Learner) -> FeatureForest:
         """Return a forest with what a pass reads."""
         context = None if number == 0 and self.base is None else self.context
-        return FeatureForest(self.features, forest, context, self.blend)
+        return FeatureForest(self.features, forest, context, self.blend, self.trainer.name)
 
     def _context_of_samples(
         self, held_out: Sequence[Sequence[FeatureForest]] = (), folds: Folds | None = None

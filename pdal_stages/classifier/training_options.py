@@ -17,7 +17,7 @@ from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
 from .class_map import MAX_LABEL
 from .context_features import OWN, Context
-from .interface import FOREST, kinds, trainer_of
+from .interface import FOREST, Estimator, PointEstimator, kinds, trainer_of
 
 #: Most passes that training makes: a third one gained nothing (docs/trials.md).
 MOST_PASSES = 3
@@ -267,8 +267,8 @@ class TrainingOptions(Settings):
             object.__setattr__(self, name, value)
 
     def _check_base(self) -> None:
-        passes: Sequence[Any] = getattr(self.base, "passes", ())
-        if not 0 < len(passes) <= MOST_PASSES or passes[0].features is None:
+        passes: Sequence[Estimator] = getattr(self.base, "passes", ())
+        if not 0 < len(passes) <= MOST_PASSES or isinstance(passes[0], PointEstimator):
             raise OptionError(
                 f"a base must be a model of up to {MOST_PASSES} forests",
                 found=", ".join(each.name for each in passes) or repr(self.base)[:60],

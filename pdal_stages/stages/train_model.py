@@ -23,7 +23,7 @@ from ..classifier.input_dimensions import (
     optional_dimensions,
     required_dimensions,
 )
-from ..classifier.interface import kinds, trainer_of
+from ..classifier.interface import Trainer, kinds, trainer_of
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import digest_of, find
 from ..classifier.training import train
@@ -31,7 +31,7 @@ from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import RECIPES, TrainingOptions, describe_recipes, with_recipe
 from .base import Stage, StageContext, files_read
 from .checked_points import select_checked
-from .options import UNWANTED, Selection, declared_option, option
+from .options import UNWANTED, Option, Selection, declared_option, option
 from .points import Points
 from .preprocessing import check as check_preprocessing
 
@@ -62,7 +62,7 @@ class TrainModel(Stage, settings=TrainingOptions):
     )
     base: str | None
     seed: int
-    algorithm: str = declared_option(TrainingOptions, "algorithm", choices=tuple(kinds()))
+    algorithm: str
     dimensions: list = declared_option(
         TrainingOptions,
         "dimensions",
@@ -88,6 +88,14 @@ class TrainModel(Stage, settings=TrainingOptions):
     files: list = option(
         "list", (), "Input files that the model file names; default: those of the readers"
     )
+
+    @classmethod
+    def all_options(cls) -> tuple[Option, ...]:
+        """Return the options; those of `algorithm` are the kinds that are registered now."""
+        return tuple(
+            replace(option, choices=tuple(kinds())) if option.name == "algorithm" else option
+            for option in super().all_options()
+        )
 
     @classmethod
     def complete(cls, raw_options: dict[str, Any]) -> dict[str, Any]:
@@ -137,7 +145,7 @@ class TrainModel(Stage, settings=TrainingOptions):
         return TrainingOptions(**values)
 
     @property
-    def _trainer(self) -> Any:
+    def _trainer(self) -> Trainer:
         return trainer_of(self.algorithm)
 
     @property

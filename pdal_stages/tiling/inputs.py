@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from ..base import las, las_check
 from ..base.errors import PipelineError, StageError
+from ..base.hashing import fingerprint
 from ..base.units import Units
 from ..pipeline.inputs_outputs import LAS_READERS, locations
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
-from .jobs import fingerprint
 from .options import (
     Box,
     Density,

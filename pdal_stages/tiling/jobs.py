@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import secrets
@@ -14,7 +13,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,7 @@ from ..base.files import make_own_folder, try_lock, whole_files
 from ..base.messages import count_of
 from ..base.version import __version__
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR
-
-if TYPE_CHECKING:
-    from .inputs import InputSource
+from .inputs import InputSource
 
 #: Most distinct warnings of tiles that a run repeats (not tuned).
 _MOST_MESSAGES = 20
@@ -195,11 +192,6 @@ def messages_of(
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"
-
-
-def fingerprint(*parts: Any) -> str:
-    """Return a digest of JSON-able values."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
 class Store:

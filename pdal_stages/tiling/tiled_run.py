@@ -15,6 +15,7 @@ from typing import Any
 from ..base import las_check
 from ..base.errors import DependencyError, StageError
 from ..base.files import sweep
+from ..base.hashing import fingerprint
 from ..base.jit import count_cached_kernels
 from ..base.messages import print_messages
 from ..base.progress import Progress
@@ -24,7 +25,7 @@ from ..pipeline.las_files import files_with_flags_to_split
 from ..pipeline.run import Pipeline
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from .inputs import CloudIndex, Survey
-from .jobs import InterruptedRun, Job, Store, TiledRun, fingerprint, messages_of, summarize
+from .jobs import InterruptedRun, Job, Store, TiledRun, messages_of, summarize
 from .options import Box, TileGrid, TilingOptions, worker_bytes
 from .plan import RunContext, TilePlan, make_plan, outputs_for
 from .run_tile import block_name, blocks_near, make_block, run_tile, square_name
