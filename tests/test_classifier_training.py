@@ -176,7 +176,7 @@ def test_several_clouds_are_sampled_together_but_are_not_neighbors():
         (np.ones_like, {}, r"at least two classes .*1: 500"),
         (lambda label: label, {"folds": 1}, r"one fold .*0 for no score"),
         (lambda label: label[:-1], {}, "one label per point"),
-        (lambda label: np.full_like(label, 7), {}, r"no points to train on.* 7, 18 are left out"),
+        (lambda label: np.full_like(label, 7), {}, r"no points to train on.*labels \(7 and 18\)"),
     ],
 )
 def test_errors_say_what_was_found(labels, more, text):

@@ -16,8 +16,8 @@ from importlib import resources
 from typing import Any
 
 from ..base import checks
-from ..base.checks import Settings, setting
 from ..base.errors import OptionError
+from ..base.options import Settings, setting
 
 _FILE = json.loads(resources.files(__package__).joinpath("networks.json").read_text("utf-8"))
 

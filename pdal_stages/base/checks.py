@@ -1,7 +1,6 @@
 """Checks of values with one wording: what was expected and what was found.
 
-Of single values, of the fields of a dataclass with a description and bounds (:class:`Settings`),
-and of JSON.
+Of single values and of JSON; options (:mod:`.options`) are checked by these.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import field, fields
 from typing import Any
 
 import numpy as np
@@ -180,42 +178,3 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(out) != len(pairs):
         raise ValueError("duplicate key in one object")
     return out
-
-
-def setting(default: Any, kind: str, help: str, *limits: float | None, **rule: Any) -> Any:
-    """Declare a field with a description of one sentence and, for a number, its two `limits`.
-
-    `kind` is ``boolean``, ``integer``, ``number`` or another word, whose values are checked only by
-    ``choices`` or ``check`` in `rule`: ``check`` is a function of a name and the value that returns
-    what the field holds. `rule` may also have the ``unit`` of a number, and ``exclusive`` for one
-    that must be above its lower limit (not of integers). With MISSING as `default` it is required.
-    """
-    if limits:
-        rule |= {"minimum": limits[0], "maximum": limits[1]}
-    return field(default=default, metadata={"kind": kind, "help": help, **rule})
-
-
-class Settings:
-    """Base of dataclasses with settings."""
-
-    def __post_init__(self) -> None:
-        """Check all settings but those that keep a default of None; OptionError for a bad value."""
-        for each in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, each.name)
-            if each.metadata and not (value is None and each.default is None):
-                object.__setattr__(self, each.name, _check(f"'{each.name}'", value, each.metadata))
-
-
-def _check(what: str, value: Any, rule: Mapping[str, Any]) -> Any:
-    if "check" in rule:
-        return rule["check"](what, value)
-    if "choices" in rule:
-        return one_of(what, value, rule["choices"])
-    if rule["kind"] == "boolean":
-        return flag(what, value)
-    if "minimum" not in rule:
-        return value
-    above, unit = rule.get("exclusive", False), rule.get("unit", "")
-    if rule["kind"] == "integer":
-        return whole(what, value, rule["minimum"], rule["maximum"], unit=unit)
-    return number(what, value, rule["minimum"], rule["maximum"], above=above, unit=unit)

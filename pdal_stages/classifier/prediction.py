@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.asprs import GROUND
-from ..base.checks import Settings, setting
 from ..base.errors import OptionError
 from ..base.messages import Report
+from ..base.options import Settings, setting
 from ..features.point_grid import CellGrid, build_grid
 from ..features.voxels import Representatives
 from .calibration import ReliabilityLimits

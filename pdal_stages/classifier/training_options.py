@@ -10,8 +10,8 @@ from typing import Any
 
 from ..base import checks
 from ..base.asprs import BUILDING, NOISE
-from ..base.checks import Settings, setting
 from ..base.errors import OptionError
+from ..base.options import Settings, setting
 from ..base.threads import resolve_threads
 from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side

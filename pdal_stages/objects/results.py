@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.checks import Settings, setting
 from ..base.grid import places_among
+from ..base.options import Settings, setting
 from .cells import Kind, point_keys
 
 

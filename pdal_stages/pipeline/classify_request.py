@@ -11,10 +11,10 @@ from typing import Any
 from ..base.asprs import OVERLAP, TERRAIN
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.las_repair import extra_dimensions
+from ..base.selections import split_selection
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..stages import preprocessing
-from ..stages.options import split_selection
 from ..stages.points import SELECTED
 from ..stages.registry import stage_from, stage_types
 from .inputs_outputs import is_las, writes_las

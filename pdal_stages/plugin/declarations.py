@@ -6,11 +6,11 @@ import hashlib
 import json
 from collections.abc import Iterator
 
+from ..base.options import Option
 from ..base.version import __version__
 from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import SPLITS
 from ..stages.base import Stage
-from ..stages.options import Option
 from ..stages.registry import stage_types
 
 #: Kind of option -> its type for PDAL's parser; others are text, which Python parses.

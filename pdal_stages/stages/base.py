@@ -14,16 +14,9 @@ from numpy.typing import NDArray
 from ..base.dimensions import CLASSIFICATION, Dimension
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
+from ..base.options import Option, decode_options, option, option_of, parse_options
 from ..base.units import named_unit
-from .options import (
-    Option,
-    Selection,
-    declared_option,
-    decode_options,
-    ignore_option,
-    option,
-    parse_options,
-)
+from .options import Selection, ignore_option
 from .points import Points
 from .where_expression import Expression
 
@@ -154,7 +147,7 @@ class Stage(ABC):
         """Declare the fields of `settings` as options, but those that the class has already."""
         for field in fields(settings) if settings is not None else ():
             if field.metadata and not hasattr(cls, field.name):
-                setattr(cls, field.name, declared_option(settings, field.name, name=field.name))
+                setattr(cls, field.name, option_of(settings, field.name))
 
     def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
         self.place = place or self.type

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from ..base.dimensions import opening_width
 from ..base.errors import ModelError, StageError
 from ..base.las import number_type
+from ..base.selections import split_selection
 from .base import WHOLE_CLOUD
-from .options import Option, split_selection
+from .options import Option
 from .registry import PDAL_OWN, stage_type, stage_types
 
 #: The preprocessing of the dimensions that a model is trained on by default.

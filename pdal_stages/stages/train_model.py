@@ -31,7 +31,7 @@ from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import RECIPES, TrainingOptions, describe_recipes, with_recipe
 from .base import Stage, StageContext, files_read
 from .checked_points import select_checked
-from .options import UNWANTED, Option, Selection, declared_option, option
+from .options import UNWANTED, Option, Selection, option, option_of
 from .points import Points
 from .preprocessing import check as check_preprocessing
 
@@ -63,7 +63,7 @@ class TrainModel(Stage, settings=TrainingOptions):
     base: str | None
     seed: int
     algorithm: str
-    dimensions: list = declared_option(
+    dimensions: list = option_of(
         TrainingOptions,
         "dimensions",
         default=(AUTO,),
