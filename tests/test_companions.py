@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 
 import laspy
 import numpy as np
@@ -61,7 +62,7 @@ def start(path, mode, end):
 
 
 def layers(path):
-    with sqlite3.connect(path) as base:
+    with closing(sqlite3.connect(path)) as base:
         assert base.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     return {str(name) for name, _ in pyogrio.list_layers(path)}
 
@@ -90,7 +91,7 @@ def test_a_geopackage_that_is_open_elsewhere_is_refused(town, tmp_path, capsys):
     finally:
         program.kill()
         program.communicate()
-    with sqlite3.connect(out) as base:
+    with closing(sqlite3.connect(out)) as base:
         assert base.execute("SELECT count(*) FROM left_behind").fetchone() == (2000,)
 
 

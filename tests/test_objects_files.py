@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from contextlib import closing
 
 import laspy
 import numpy as np
@@ -19,6 +20,7 @@ from pdal_stages.synthetic import write_town
 shapely = pytest.importorskip("shapely")
 pytest.importorskip("shapely.affinity")
 pyogrio = pytest.importorskip("pyogrio")
+pyproj = pytest.importorskip("pyproj")
 LAYERS = ("buildings", "trees", "crowns", "spans", "decks")
 
 
@@ -93,7 +95,7 @@ def test_one_file_or_four_give_the_same(folder, capsys):
     assert len(shapes) > 8 and (buildings["h_ridge"] >= buildings["h_eave"]).all()
     overlap = shapely.area(shapes).sum() - shapely.union_all(shapes).area
     assert overlap < 1e-2 * len(shapes)
-    with sqlite3.connect(folder / "one.gpkg") as base:
+    with closing(sqlite3.connect(folder / "one.gpkg")) as base:
         table = "layer_styles ORDER BY update_time"  # as QGIS asks
         styled = base.execute(f"SELECT f_table_name, styleQML FROM {table}").fetchall()
     assert [name for name, _ in styled] == list(LAYERS) and all(
@@ -116,6 +118,44 @@ def test_other_formats_hold_the_same(folder, tmp_path, ending="shp"):
     assert about["crs"] and (tmp_path / "town_buildings.qml").read_text().startswith(
         "<!DOCTYPE qgis"
     )
+
+
+@pytest.mark.pdal
+def test_measures_have_the_unit_of_the_coordinates(folder, tmp_path):
+    """A survey in feet: shapes and columns alike; heights may have a unit of their own."""
+    las = laspy.read(folder / "town.laz")
+    z_unit = 0.5
+    feet = laspy.LasHeader(point_format=6, version="1.4")
+    feet.scales, feet.offsets = [0.001] * 3, [1_640_000, 17_716_000, 0]
+    out = laspy.LasData(feet)
+    out.x, out.y, out.z = las.x / 0.3048, las.y / 0.3048, las.z / z_unit
+    out.classification = las.classification
+    out.write(tmp_path / "feet.laz")
+    compound = pyproj.CRS.from_wkt(
+        'COMPD_CS["survey",' + pyproj.CRS(2992).to_wkt("WKT1_GDAL") + ',VERT_CS["heights",'
+        f'VERT_DATUM["d",2005],UNIT["half meter",{z_unit}],AXIS["Up",UP]]]'
+    )
+    reader = {"type": "readers.las", "filename": str(tmp_path / "feet.laz")}
+    reader["override_srs"] = compound.to_wkt("WKT1_GDAL")
+    writer = {"type": "writers.objects", "filename": str(tmp_path / "feet.gpkg"), "cell": 0.5}
+    Pipeline([reader, writer]).execute(arrays=False)
+    writer["filename"] = str(tmp_path / "meters.gpkg")
+    Pipeline([str(folder / "town.laz"), writer]).execute(arrays=False)
+    for name in ("buildings", "decks"):
+        columns, shapes, _ = layer(tmp_path / "feet.gpkg", name)
+        np.testing.assert_allclose(columns["area"], shapely.area(shapes), rtol=0.01)
+    for name, column, unit in (
+        ("buildings", "h_ridge", z_unit),
+        ("buildings", "ground", z_unit),
+        ("buildings", "area", 0.3048**2),
+        ("trees", "height", z_unit),
+        ("trees", "diam", 0.3048),
+        ("spans", "length", 0.3048),
+        ("spans", "z_high", z_unit),
+    ):
+        here, there = (layer(tmp_path / f"{kind}.gpkg", name)[0] for kind in ("feet", "meters"))
+        ours, theirs = np.median(here[column]) * unit, np.median(there[column])
+        assert ours == pytest.approx(theirs, rel=0.1), (name, column)
 
 
 @pytest.mark.pdal

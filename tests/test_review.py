@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
+from contextlib import closing
 
 import laspy
 import numpy as np
@@ -70,7 +71,9 @@ def test_places_are_told_in_the_coordinates_of_the_files():
     x, y = feet.rows[0]["at"]
     assert np.allclose(np.multiply((x, y), foot), meters.rows[0]["at"], atol=1e-3)
     assert review_files.lines(feet.to_dict())[-1].endswith(f"a.laz at {x:.1f}, {y:.1f}")
-    assert review_files.review_layers(feet)["patches"].shapes[0].contains(shapely.Point(x, y))
+    patches = review_files.review_layers(feet)["patches"]
+    assert patches.shapes[0].contains(shapely.Point(x, y))
+    assert np.allclose(patches.columns["area"], shapely.area(patches.shapes), rtol=1e-3)
 
 
 def test_patches_hold_each_cell_once_and_come_best_first():
@@ -123,12 +126,11 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
         and "building, reliability 0.5" in figures["worst"][0]["reason"]
     )
     assert np.isclose(figures["expected"], sum(t["expected"] for t in figures["tiles"]))
-    base = sqlite3.connect(out)
-    rank, reason, expected = zip(
-        *base.execute("SELECT rank, reason, expected FROM patches ORDER BY fid"), strict=True
-    )
-    styles = dict(base.execute("SELECT f_table_name, styleQML FROM layer_styles"))
-    base.close()
+    with closing(sqlite3.connect(out)) as base:
+        rank, reason, expected = zip(
+            *base.execute("SELECT rank, reason, expected FROM patches ORDER BY fid"), strict=True
+        )
+        styles = dict(base.execute("SELECT f_table_name, styleQML FROM layer_styles"))
     assert rank == tuple(range(1, len(rank) + 1)) and all(reason) and min(expected) >= 0
     assert set(styles) == {"patches", "tiles"} and "looked at" in styles["patches"]
     # One file or two: the same is expected in all.
@@ -183,7 +185,7 @@ def test_files_without_points(tmp_path, run, write_las):
     assert (
         "0 points judged" in output and json.loads((tmp_path / "r.json").read_text())["points"] == 0
     )
-    with sqlite3.connect(tmp_path / "r.gpkg") as base:
+    with closing(sqlite3.connect(tmp_path / "r.gpkg")) as base:
         for name in ("patches", "tiles"):
             assert base.execute(f"select count(*) from {name}").fetchone() == (0,)
 

@@ -27,6 +27,13 @@ COLUMNS = {
     Kind.SPAN: "length h_low z_high sag points reliab verdict reason",
     Kind.DECK: "area z clear ground points reliab verdict reason",
 }
+#: Columns of measures by the power of the coordinates' horizontal and vertical unit in them.
+_POWERS: dict[str, tuple[int, int]] = {
+    "area": (2, 0),
+    **dict.fromkeys(("diam", "length"), (1, 0)),
+    **dict.fromkeys(("h_eave", "h_ridge", "height", "h_low", "z_high", "sag"), (0, 1)),
+    **dict.fromkeys(("ground", "z", "clear"), (0, 1)),
+}
 _TYPES = {"points": np.int64, "verdict": object, "reason": object}
 #: Class whose color the sure objects of a layer have, and their opacity of 255.
 _COLORS = {
@@ -51,12 +58,13 @@ def object_layers(
     straight : bool
         Outlines of buildings and decks along walls, instead of along cells.
     units : Units, optional
-        Of the coordinates; measures are in meters whatever these are.
+        Of the coordinates, which shapes and measures are written in; by default meters.
     """
     shapely = vector("shapely")
-    horizontal, vertical = (units.horizontal, units.vertical) if units else (1.0, 1.0)
     size, tables = objects.settings.cell, objects.tables
-    columns = {kind: _columns(table, kind) for kind, table in tables.items()}
+    units = units or Units()
+    horizontal, vertical = units.horizontal, units.vertical
+    columns = {kind: _columns(table, kind, units) for kind, table in tables.items()}
 
     def polygons(shapes: list[Any], kind: Kind) -> Layer:
         """Return shapes in the coordinates' unit, to a thousandth where that keeps them valid."""
@@ -70,7 +78,8 @@ def object_layers(
     for kind, name in ((Kind.BUILDING, "buildings"), (Kind.DECK, "decks")):
         shapes = raw_outlines(tables[kind], size)
         shapes = straight_outlines(shapes) if straight else shapes
-        columns[kind]["area"] = np.round(np.array([shape.area * size**2 for shape in shapes]), 3)
+        areas = np.array([shape.area * size**2 for shape in shapes])
+        columns[kind]["area"] = _in_unit("area", areas, units)
         layers[name] = polygons(shapes, kind)
     trees = tables[Kind.TREE]
     crowns = raw_outlines(trees, size, hole=OUTLINE_RULES.min_crown_hole)
@@ -83,13 +92,19 @@ def object_layers(
     return {name: layers[name] for name in LAYERS}
 
 
-def _columns(table: ObjectTable, kind: Kind) -> dict[str, NDArray]:
-    """Return the attributes of a table by name, numbers rounded to 3 decimals."""
+def _columns(table: ObjectTable, kind: Kind, units: Units) -> dict[str, NDArray]:
+    """Return the attributes of a table by name, measures in the unit of the coordinates."""
     out: dict[str, NDArray] = {"object_id": table.ids}
     for name in COLUMNS[kind].split():
         values = table.columns.get(name, np.empty(0)).astype(_TYPES.get(name, np.float64))
-        out[name] = np.round(values, 3) if values.dtype == np.float64 else values
+        out[name] = _in_unit(name, values, units) if values.dtype == np.float64 else values
     return out
+
+
+def _in_unit(name: str, values: NDArray[np.float64], units: Units) -> NDArray[np.float64]:
+    """Return measures (n,) in meters in the unit of the coordinates, rounded to 3 decimals."""
+    across, upward = _POWERS.get(name, (0, 0))
+    return np.round(values / (units.horizontal**across * units.vertical**upward), 3)
 
 
 def write_objects(

@@ -263,7 +263,8 @@ def review_layers(review: Review) -> dict[str, Layer]:
     shapes = [shapely.union_all(boxes[cells]) for cells in np.split(order, ends)[:-1]]
     tiles = [row for row in review.tiles if row["points"]]
     outlines = [shapely.box(*shapely.total_bounds(boxes[file == row["file"]])) for row in tiles]
-    patches = [{**row, "done": 0} for row in review.rows]
+    square = review.unit**2  # as the geometry; of the text and the JSON it is m2
+    patches = [{**row, "area": row["area"] / square, "done": 0} for row in review.rows]
     layers = {}
     for name, drawn, rows in (("patches", shapes, patches), ("tiles", outlines, tiles)):
         polygons = [shapely.MultiPolygon(shapely.get_parts(shape)) for shape in drawn]
