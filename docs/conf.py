@@ -41,6 +41,19 @@ html_sidebars = {"index": []}
 html_show_sourcelink = False
 html_static_path = ["static"]
 html_css_files = ["custom.css"]
+
+
+def setup(app):
+    """Lead links that a clone has to the pages that are generated."""
+
+    def replace(app, page, content):
+        text = content[0].replace("](stage_texts/)", "](stages/index.md)")
+        text = text.replace("](stage_texts/", "](stages/")
+        content[0] = text.replace("](../README.md#", "](index.md#")
+
+    app.connect("source-read", replace)
+
+
 autodoc_member_order = "bysource"
 autodoc_typehints = (
     "none"  # docstrings say shapes and units; NumPy's own names of types fill ten lines

@@ -15,11 +15,13 @@ from .base.version import __version__
 _WHERE = {
     "Accuracy": "accuracy",
     "Cells": "objects.cells",
+    "ComparedClasses": "accuracy.labels",
     "Filter": "pipeline.python_pdal",
     "Model": "classifier.model",
     "ObjectSettings": "objects.results",
     "FeatureTable": "features",
     "Pipeline": "pipeline.run",
+    "Place": "reports.accuracy_page",
     "StageError": "base.errors",
     "TrainingCloud": "classifier.training_clouds",
     "TrainingOptions": "classifier.training_options",
@@ -44,6 +46,7 @@ _WHERE = {
 __all__ = [*_WHERE, "__version__"]
 
 if TYPE_CHECKING:
+    from .accuracy.labels import ComparedClasses
     from .accuracy.measures import Accuracy
     from .base.errors import StageError
     from .classifier.model import Model, load_model
@@ -57,7 +60,7 @@ if TYPE_CHECKING:
     from .objects.results import ObjectSettings
     from .pipeline.python_pdal import Filter, Writer
     from .pipeline.run import Pipeline, run_pipeline
-    from .reports.accuracy_page import write_accuracy_report
+    from .reports.accuracy_page import Place, write_accuracy_report
     from .reports.object_layers import object_layers
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima

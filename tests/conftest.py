@@ -16,7 +16,7 @@ Markers
 Environment
     PDAL_STAGES_DATA     folder of the real clouds; default ``../shared/data`` beside the checkout
     PDAL_STAGES_REQUIRE  comma-separated: ``pdal`` makes a skip for want of PDAL a failure, ``data``
-                         one for want of the real clouds, ``torch`` one for want of PyTorch
+                         one for want of the real clouds, ``torch`` and ``qgis`` one for want of PyTorch or QGIS
                          (continuous integration sets ``pdal``, and ``torch`` where it can be
                          installed)
 """
@@ -65,6 +65,7 @@ REQUIRED = {
 }
 NO_DATA = "real clouds not found"
 NO_TORCH = "PyTorch is not installed"
+NO_QGIS = "QGIS is not installed"
 
 # A skip reason that names PDAL itself. "PDAL 2.5" or "PDAL >= 2.5" asks for a version, which is
 # another matter, and PDAL_STAGES_DATA is another word.
@@ -134,8 +135,9 @@ def _forbidden(report) -> str | None:
     reason = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
     if reason.startswith(f"Skipped: {NO_DATA}"):
         return reason if "data" in REQUIRED else None
-    if NO_TORCH in reason:
-        return reason if "torch" in REQUIRED else None
+    for missing, name in ((NO_TORCH, "torch"), (NO_QGIS, "qgis")):
+        if missing in reason:
+            return reason if name in REQUIRED else None
     return reason if "pdal" in REQUIRED and WANT_OF_PDAL.search(reason) else None
 
 

@@ -121,6 +121,16 @@ def test_other_formats_hold_the_same(folder, tmp_path, ending="shp"):
 
 
 @pytest.mark.pdal
+@pytest.mark.parametrize("ending", ["gpkg", "geojson", "fgb", "shp"])
+def test_layers_without_objects_are_written_without_a_word(tmp_path, write_las, run, ending):
+    x, y = (v.ravel() * 0.5 for v in np.meshgrid(np.arange(40.0), np.arange(40.0)))
+    arrays = {"X": x, "Y": y, "Z": 0 * x, "Classification": np.full(len(x), 2, np.uint8)}
+    source = write_las(tmp_path / "flat.laz", arrays, point_format=6)
+    code, _, err = run("objects", source, tmp_path / f"o.{ending}", "--no-progress")
+    assert code == 0 and "arning" not in err, err
+
+
+@pytest.mark.pdal
 def test_measures_have_the_unit_of_the_coordinates(folder, tmp_path):
     """A survey in feet: shapes and columns alike; heights may have a unit of their own."""
     las = laspy.read(folder / "town.laz")

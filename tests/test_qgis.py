@@ -290,7 +290,7 @@ def test_parameters_are_the_commands_own(session, capsys):
     for name in ("BRIDGES", "WIRES", "VEGETATION_HEIGHTS"):
         assert name in shown and not shown[name][1]
     heights = session("parameters", "heights")["parameters"]
-    assert heights["WINDOW"][2] == "75.0" and heights["WINDOW"][3].startswith(
+    assert heights["WINDOW"][2] == "18.0" and heights["WINDOW"][3].startswith(
         "Radius of the largest window"
     )
 
@@ -361,6 +361,6 @@ def test_many_files_and_training(algorithm, ready_halves, ready_town, tmp_path):
     assert (tmp_path / "r.json").is_file()
     few = {"COUNT": 50, "TREES": 5, "NEIGHBORHOODS": "k10"}
     output = algorithm("train", INPUTS=ready_town, MODEL=model, **few)
-    assert output.count("blocks held out") == 1
+    assert output.count("blocks held out  overall accuracy") == 1
     algorithm("classify", INPUT=ready_town, MODEL=model, OUTPUT=tmp_path / "m.laz")
     assert (tmp_path / "m.laz").is_file()

@@ -33,7 +33,7 @@ _CLASSIFIER_OPTIONS = ("vegetation_heights", "keep_sure")
 def add_commands(parser: Parser) -> None:
     """Add ``classify``."""
     help = "Classify point clouds: ground, vegetation, buildings and more"
-    rare = ("ground", "dimensions", "bridges", "metadata", "scheduler", "per")
+    rare = ("ground", "dimensions", "metadata", "scheduler", "per")
     add = parser.command("classify", _classify, help, overrides=True, progress=True, rare=rare)
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     add("output", help="A file, a folder, or a name with # for the input's")

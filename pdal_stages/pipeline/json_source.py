@@ -43,9 +43,9 @@ class PipelineSource:
 
 
 def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
-    """Read a pipeline from a file name, JSON text, or Python lists and dicts."""
+    """Read a pipeline from a file name, JSON text, or Python lists, dicts, python-pdal stages."""
     if isinstance(source, list | dict):
-        stages = _list_of_stages(source, "")
+        stages = [_written(stage) for stage in _list_of_stages(source, "")]
         return _checked(PipelineSource(list(stages), [0] * len(stages)))
     text = str(source)
     if text.lstrip("\ufeff \t\r\n")[:2].startswith(("[", "{", "//", "/*")):
@@ -59,6 +59,12 @@ def read_pipeline(source: str | Path | list | dict) -> PipelineSource:
         where = ascii(text[:200])[1:-1]
         raise PipelineError("the pipeline file cannot be read", where=where, found=error) from None
     return parse_pipeline(decode(data, text), text)
+
+
+def _written(stage: Any) -> Any:
+    """Return a stage of python-pdal as an object of JSON; others as they are."""
+    options = getattr(stage, "options", None)
+    return {"type": stage.type, **options} if isinstance(options, dict) else stage
 
 
 def decode(data: bytes, name: str) -> str:

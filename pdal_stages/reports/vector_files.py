@@ -98,6 +98,8 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
             warnings.filterwarnings("ignore", "Passed SRS uses EPSG")
+            # GDAL takes an empty shapefile of lines for one with measures.
+            warnings.filterwarnings("ignore", "Measured .M. geometry types")
             pyogrio.raw.write(
                 path,
                 shapely.to_wkb(np.array(layer.shapes, object)),
@@ -109,7 +111,7 @@ def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
                 layer=layer_name,
                 **({"VERSION": "1.2"} if layer_name else {}),  # GDAL before 3.7 warns of others
             )
-        info = pyogrio.read_info(path, layer=layer_name, force_feature_count=True)
+            info = pyogrio.read_info(path, layer=layer_name, force_feature_count=True)
     except (
         pyogrio.errors.DataSourceError,
         pyogrio.errors.DataLayerError,

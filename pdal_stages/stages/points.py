@@ -30,6 +30,8 @@ MAKERS = {
     '"Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
 }
+#: The note on points without a spatial reference. Tiles show it where no input has one.
+METERS_ASSUMED = "the points have no spatial reference: meters were assumed"
 #: How the warning begins that a `where` matches no point. Tiles show it if it holds for all.
 NO_POINT_MATCHES = "'where' matches no points:"
 #: The same for polygons of a file that lie nowhere near the points.
@@ -109,7 +111,7 @@ class Points:
             self.wkt, horizontal=self.unit_names[0], vertical=self.unit_names[1], place=place
         )
         if units.assumed and self.count:
-            self.report.notes.append("the points have no spatial reference: meters were assumed")
+            self.report.notes.append(METERS_ASSUMED)
             refuse_likely_degrees(self.count, x.min(), y.min(), x.max(), y.max())
         return units
 

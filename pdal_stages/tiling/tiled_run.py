@@ -23,7 +23,9 @@ from ..base.version import build
 from ..pipeline.json_source import Override
 from ..pipeline.las_files import files_with_flags_to_split
 from ..pipeline.run import Pipeline
+from ..pipeline.spatial_reference import NO_REFERENCE
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
+from ..stages.points import METERS_ASSUMED
 from .inputs import CloudIndex, Survey
 from .jobs import InterruptedRun, Job, Store, TiledRun, messages_of, summarize
 from .options import Box, TileGrid, TilingOptions, worker_bytes
@@ -109,10 +111,11 @@ def run_plan(
         _try_on_an_input(pipeline, survey, len(plan.readers))
     if dry_run:
         return estimate(plan, survey)
-    if not folder.is_dir():
-        raise StageError(
-            "the folder of the output does not exist", found=str(folder), cure="Create it first"
-        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        what = "the folder of the output cannot be created"
+        raise StageError(what, found=f"{folder}: {error.strerror}") from None
     if plan.makes and progress is not False and not chosen.scheduler and not count_cached_kernels():
         print_messages("compiling for this processor first, once: it takes a minute or two")
     folders = {folder, *(Path(path).parent for paths in survey.outputs for path in paths)}
@@ -194,9 +197,10 @@ class _Run:
             "peak_mb_of_a_worker": self.peak_mb,
         }
         most = survey.options.most_points
-        messages = survey.messages + messages_of(
-            self.tiles, self.squares, self.messages_before, most
-        )
+        messages = messages_of(self.tiles, self.squares, self.messages_before, most)
+        if any(NO_REFERENCE in text for text in survey.messages):  # it tells what is assumed
+            messages = [text for text in messages if METERS_ASSUMED not in text]
+        messages = survey.messages + messages
         changed = survey.changed()
         return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
 

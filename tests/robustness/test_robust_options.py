@@ -161,7 +161,10 @@ def test_options_nested_too_deeply(command, tmp_path, monkeypatch, deep):
         ps.run_pipeline([{"type": HEIGHTS, "ignore": value}])
 
 
-def test_a_long_where_that_matches_nothing_is_printed_in_part(command, tmp_path, cloud):
+def test_a_long_where_that_matches_nothing_is_printed_in_part(
+    command, tmp_path, monkeypatch, cloud
+):
+    monkeypatch.chdir(tmp_path)
     where = " || ".join(["Z > 1e9"] * 2000)
     path = job(tmp_path, cloud, {"type": HEIGHTS, "where": where}, OUT)
     message = command.runs(["pipeline", path]).err
