@@ -18,6 +18,7 @@ from pdal_stages.alsnet.batches import (
 )
 from pdal_stages.alsnet.configuration import parse_configuration
 from pdal_stages.base.errors import OptionError
+from pdal_stages.classifier.training_options import RECIPES
 from pdal_stages.features.cell_means import density
 
 # ---- references ------------------------------------------------------------------------------------------
@@ -137,6 +138,20 @@ def test_points_are_in_four_batches_on_average():
     assert 3.7 < coverage(batches).mean() < 4.3
     inside = ((xyz[:, :2] > 20) & (xyz[:, :2] < 80)).all(axis=1)
     assert 3.8 < coverage(batches)[inside].mean() < 4.2
+
+
+def test_with_a_far_reach_every_batch_is_the_nearest_points():
+    """[WM19 3]: the nearest 200,000 points; at the cloud's edge they lie beyond 1.5 spacings."""
+    xyz = np.random.default_rng(0).random((8_000, 3)) * [80.0, 60.0, 10.0]
+    xyz = xyz[(xyz[:, 0] > 30) | (xyz[:, 1] < 30)]  # an L
+    spacing = spacing_for(1000, density(xyz))
+    sizes = {
+        reach: [len(batches.members(number)) for number in range(len(batches))]
+        for reach in (1.5, 4.0)
+        for batches in [Batches(xyz, 1000, spacing, reach=reach)]
+    }
+    assert min(sizes[1.5]) < 1000 and set(sizes[4.0]) == {1000}
+    assert RECIPES["winiwarter2019"]["alsnet"]["reach"] == 4
 
 
 # ---- pyramids -----------------------------------------------------------------------------------------------

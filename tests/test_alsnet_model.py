@@ -124,6 +124,20 @@ def test_a_tile_with_its_halo_gets_the_labels_of_the_whole():
     assert np.array_equal(tile.probabilities[ours[near]], whole.probabilities[ours])
 
 
+def test_the_reach_of_batches_is_part_of_the_model(tmp_path):
+    xyz, _, values = scene(n=2000, side=20.0)
+    near, far = (model_of(dataclasses.replace(random_net(), reach=reach)) for reach in (1.5, 4.0))
+    assert far.halo_m == pytest.approx((8.0 + 0.5**0.5) * 3.0)
+    far.save(tmp_path / "far.model")
+    again = load_model(tmp_path / "far.model")
+    assert again.halo_m == far.halo_m
+    p = [
+        next(model.algorithm.predict(PredictRequest(xyz, values))).probabilities
+        for model in (near, far, again)
+    ]
+    assert not np.array_equal(p[0], p[1]) and np.array_equal(p[1], p[2])
+
+
 def test_small_and_empty_clouds():
     model = model_of(random_net(("Z",)))
     assert len(model.predict(np.zeros((0, 3)), {}).classification) == 0

@@ -2,7 +2,10 @@
 
 import dataclasses
 import importlib.util
+import json
+from importlib.resources import files
 
+import jsonschema
 import laspy
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from alsnet_scenes import TINY, model_of, random_net, scene
 
 import pdal_stages as ps
 from pdal_stages import load_model
+from pdal_stages.alsnet.batches import Batches
 from pdal_stages.base.errors import DimensionError, OptionError
 from pdal_stages.stages.registry import stage_type
 
@@ -144,6 +148,33 @@ def test_color_and_echo_width_of_a_file_are_inputs(tmp_path, write_las, pdal_mod
     bare = str(write_las(tmp_path / "bare.las", arrays, point_format=7))
     with pytest.raises(DimensionError, match="EchoWidth"):
         ps.run_pipeline([bare, {"type": "filters.modelclassifier", "model": output}])
+
+
+@pytest.mark.pdal
+def test_accuracy_of_each_batch(cloud, model, tmp_path, pdal_module):
+    """[WM19 Figure 3]: a share for each batch, at its center, in the JSON of filters.accuracy."""
+    path = cloud[0]
+    stages = [
+        {"type": "readers.las", "filename": str(path)},
+        {"type": "filters.ferry", "dimensions": "Classification=>Reference"},
+        {"type": "filters.modelclassifier", "model": str(model)},
+        {"type": "filters.accuracy", "json": str(tmp_path / "a.json"), "print": False},
+        las_writer(tmp_path / "out.las"),
+    ]
+    ps.run_pipeline(stages)
+    written = json.loads((tmp_path / "a.json").read_text())
+    schema = files("pdal_stages.accuracy").joinpath("accuracy-1.json").read_text()
+    jsonschema.Draft202012Validator(json.loads(schema)).validate(written)
+    out = laspy.read(tmp_path / "out.las")
+    right = np.asarray(out.classification) == np.asarray(out.Reference)
+    net = load_model(model).algorithm
+    batches = Batches(np.asarray(out.xyz), net.configuration.points, net.spacing)
+    assert len(written["batches"]) == len(batches) > 50
+    for number, entry in enumerate(written["batches"]):
+        rows = batches.members(number)
+        assert (entry["x"], entry["y"]) == tuple(batches.centers[number])
+        assert entry["points"] == len(rows)
+        assert entry["overall_accuracy"] == pytest.approx(right[rows].mean())
 
 
 def test_stage_options(model, tmp_path):

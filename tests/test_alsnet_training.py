@@ -59,12 +59,13 @@ def test_batches_of_one_class_are_passed_over_unless_a_class_would_be_lost():
     lonely = (xyz[:, 0] < 4) & (xyz[:, 1] < 4)
     labels[lonely] = 2
     batches = Batches(xyz, 200, 6.0)
-    chosen = select_batches(batches, labels, 3, 30.0)
+    chosen, added = select_batches(batches, labels, 3, 30.0)
+    assert added == 1  # for the class 2
     shares = [np.bincount(labels[batches.members(k)], minlength=3) for k in chosen]
     assert 1 < len(chosen) < len(batches)
     assert sum(histogram_deviation(s) >= 30.0 for s in shares) == 1
     assert sum(shares)[2] > 0
-    assert len(select_batches(batches, labels, 3, 100.0)) == len(batches)
+    assert select_batches(batches, labels, 3, 100.0) == (list(range(len(batches))), 0)
 
 
 def test_ground_held_out_is_whole_blocks_with_all_classes():

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from block_scene import ground_and_block
@@ -76,6 +77,28 @@ def test_a_model_of_arrays_classifies_files_alike(scene, small, tmp_path, write_
     classified = laspy.read(tmp_path / "o.las")
     xyz = np.column_stack([classified.x, classified.y, classified.z])
     assert np.array_equal(np.asarray(classified.classification), model.predict(xyz).classification)
+
+
+@pytest.mark.pdal
+def test_functions_give_the_bits_of_stages_on_rounded_coordinates(tmp_path, write_las):
+    """docs/api.md: a stage rounds coordinates to 1e-6 of the file's unit, the functions do not."""
+    rng = np.random.default_rng(0)
+    cells = rng.integers(0, 120, (3000, 3)) / 10 * [1, 1, 0.1]  # many neighbors exactly at a radius
+    xyz = cells + np.array([632_000.3, 5_400_000.7, 100.1])
+    arrays = dict(zip("XYZ", xyz.T, strict=True))
+    path = write_las(tmp_path / "a.las", arrays, offset=[632_000.3, 5_400_000.7, 0.1])
+    words = {"neighborhoods": "c1,s1,kopt", "feature_set": "covariance,geometric"}
+    pipeline = ps.Pipeline([str(path), {"type": "filters.multiscalefeatures", **words}])
+    pipeline.execute()
+    las = laspy.read(path)
+    raw = np.column_stack([las.x, las.y, las.z])
+    same = [
+        all(np.array_equal(table[name], pipeline.arrays[0][name]) for name in table.names)
+        for xyz in (np.rint(raw * 1e6) / 1e6, raw)
+        for table in [ps.compute_features(xyz, **words)]
+    ]
+    assert same == [True, False]
+    assert "np.rint(np.column_stack" in (ROOT / "docs" / "api.md").read_text()
 
 
 def test_every_public_name_is_on_the_api_page():

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
@@ -86,6 +87,22 @@ def test_numpy_snippet_runs(tmp_path, monkeypatch, write_las, capsys, random_clo
     (snippet,) = blocks(ROOT / "docs" / "api.md", "python")
     exec(compile(snippet, "api.md", "exec"), {})
     assert "Linearity_c1" in capsys.readouterr().out
+
+
+@pytest.mark.pdal
+def test_the_readme_shows_the_height_that_the_project_began_with(
+    tmp_path, monkeypatch, write_las, pdal_module
+):
+    """filters.hag_minima [W18], in a pipeline of one line, which runs as printed."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    arrays = dict(zip("XYZ", rng.uniform(0, 60, (3, 2000)), strict=True))
+    write_las("raw.laz", arrays, point_format=6)
+    (line,) = [text for text in blocks(ROOT / "README.md", "json") if "hag_minima" in text]
+    assert len(line.splitlines()) == 1
+    ps.run_pipeline(json.loads(line))
+    expected = ps.hag_minima(*laspy.read("raw.laz").xyz.T)
+    assert np.allclose(laspy.read("heights.laz").HeightAboveGround, expected, atol=1e-4)
 
 
 @pytest.mark.pdal

@@ -32,6 +32,7 @@ import numpy.typing as npt
 from ..base.asprs import class_name
 from ..base.errors import StageError
 from .labels import (
+    MAX_LABEL,
     ComparedClasses,
     Merge,
     as_codes,
@@ -348,6 +349,20 @@ class Accuracy:
         order = np.argsort(-wrong[i, j], kind="stable")[:most]
         pairs = zip(i[order], j[order], strict=True)
         return [(self.classes[a], self.columns[b], int(wrong[a, b])) for a, b in pairs]
+
+    def merge(self, codes: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return codes (n,) with those that were merged as the code that they count as."""
+        target_of = np.arange(MAX_LABEL + 1)
+        target_of[list(self.merged)] = list(self.merged.values())
+        return target_of[codes]
+
+    def verdicts(
+        self, reference: npt.NDArray[Any], predicted: npt.NDArray[Any]
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Return which points were compared, and which are wrong, of codes (n,) before merging."""
+        true = self.merge(reference)
+        compared = np.isin(true, self.classes) & ~np.isin(reference, list(self.left_out))
+        return compared, compared & (true != self.merge(predicted))
 
     def name(self, code: int) -> str:
         """Return the name of a class."""

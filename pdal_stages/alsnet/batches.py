@@ -21,12 +21,10 @@ from scipy.spatial import cKDTree
 from ..base.errors import OptionError
 from ..base.hashing import hash_rows
 from ..base.jit import njit
-from .configuration import Configuration
+from .configuration import REACH, Configuration
 
 #: Batches each point is in, on average, in a cloud of even density.
 COVERAGE = 4.0
-#: Farthest point a batch takes, in spacings. A batch of full size in even density has 1.13.
-REACH = 1.5
 #: How often a cell may be halved: of a spacing of 16 m a cell is then a micrometer.
 DEEPEST = 24
 #: Points of a bucket of the farthest point sampling: for speed alone.
@@ -50,14 +48,14 @@ def spacing_for(points: int, per_square_meter: float) -> float:
     return max(round(math.sqrt(points / (COVERAGE * per_square_meter)), 2), 0.05)
 
 
-def halo_m(spacing: float) -> float:
+def halo_m(spacing: float, reach: float = REACH) -> float:
     """Return the meters around a tile that its results depend on.
 
-    A point's batches have their grid points within ``REACH`` spacings of it and take points as far
+    A point's batches have their grid points within `reach` spacings of it and take points as far
     again; which grid points there are depends on the cell they were halved from, whose center is up
     to half a cell's diagonal away, and on what lies within reach of that.
     """
-    return (2.0 * REACH + math.sqrt(0.5)) * spacing
+    return (2.0 * reach + math.sqrt(0.5)) * spacing
 
 
 class Batches:
@@ -77,6 +75,9 @@ class Batches:
         Of the grid, meters.
     inputs : (n, c) array, optional
         Other values of the points, to tell points at the same place apart.
+    reach : float
+        Farthest point of a batch from its grid point, in spacings: a batch is the `points` nearest
+        ones, or fewer where there are not so many within reach.
 
     Attributes
     ----------
@@ -92,10 +93,11 @@ class Batches:
         points: int,
         spacing: float,
         inputs: npt.NDArray[Any] | None = None,
+        reach: float = REACH,
     ) -> None:
         if not spacing > 0.0:
             raise OptionError("the spacing of batches must be more than 0 m", found=spacing)
-        self.points, self.spacing, self.reach = int(points), float(spacing), REACH * float(spacing)
+        self.points, self.spacing, self.reach = int(points), float(spacing), reach * float(spacing)
         more = () if inputs is None else inputs.T
         self._row = np.lexsort([*more, xyz[:, 2], xyz[:, 1], xyz[:, 0]])  # the canonical order
         self._xy = np.ascontiguousarray(xyz[self._row, :2])

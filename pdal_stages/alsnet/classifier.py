@@ -15,7 +15,7 @@ from ..base.threads import map_blocks, resolve_threads
 from ..classifier.input_dimensions import add_return_features, take_dimensions
 from ..classifier.interface import ArrayRule, Block, InputPlan, PredictRequest
 from .batches import Batches, Pyramid, augment, build_pyramid, halo_m, random_order
-from .configuration import Configuration, parse_configuration
+from .configuration import REACH, Configuration, parse_configuration
 from .network import NumpyNetwork, Weights, check_weights
 
 #: A network whose batch would need more megabytes is not loaded; the published ones need a few
@@ -37,6 +37,7 @@ class AlsNet:
     scale: tuple[float, ...]
     spacing: float  #: of the batches' grid, meters
     n_classes: int
+    reach: float = REACH  #: farthest point of a batch, spacings
 
     name: ClassVar[str] = "alsnet"
     features: ClassVar[None] = None
@@ -66,8 +67,10 @@ class AlsNet:
         if needed > MOST_MB:
             raise ModelError("a batch would need too much memory", found=f"{needed:,.0f} MB")
         check_weights(arrays, configuration, n_features, n_classes)
-        spacing = float(parameters["spacing"])
-        return cls(dict(arrays), configuration, tuple(names), mean, scale, spacing, n_classes)
+        spacing, reach = float(parameters["spacing"]), float(parameters.get("reach", REACH))
+        return cls(
+            dict(arrays), configuration, tuple(names), mean, scale, spacing, n_classes, reach
+        )
 
     def arrays(self) -> Weights:
         """Return the weights, which a model file stores."""
@@ -79,6 +82,7 @@ class AlsNet:
             "parameters": {
                 "configuration": self.configuration.to_dict(),
                 "spacing": self.spacing,
+                "reach": self.reach,
                 "inputs": [
                     {"name": name, "mean": mean, "scale": scale}
                     for name, mean, scale in zip(self.inputs, self.mean, self.scale, strict=True)
@@ -97,7 +101,7 @@ class AlsNet:
     @property
     def plan(self) -> InputPlan:
         """Its inputs; X, Y and Z are taken from the batch's center, and batches are cut by area."""
-        return InputPlan(self.inputs, self.inputs, halo_m(self.spacing))
+        return InputPlan(self.inputs, self.inputs, halo_m(self.spacing, self.reach))
 
     @cached_property
     def network(self) -> NumpyNetwork:
@@ -134,6 +138,14 @@ class AlsNet:
         variance = (squares / count - (mean * mean).sum(axis=1)) / self.n_classes
         yield Block(rows, mean, np.maximum(variance, 0.0))
 
+    def batches(
+        self, xyz: npt.NDArray[np.float64]
+    ) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]]:
+        """Yield the center (2,) and the rows (k,) of each batch of points (n, 3), in meters."""
+        batches = Batches(xyz, self.configuration.points, self.spacing, reach=self.reach)
+        for number, center in enumerate(batches.centers):
+            yield center, batches.members(number)
+
     def _apply_on(self, device: str) -> Callable[[Pyramid], npt.NDArray[np.float64]]:
         """Return the function that applies the network to a batch, with NumPy or PyTorch."""
         if device == "cpu":
@@ -157,7 +169,7 @@ class AlsNet:
 
         xyz = request.xyz
         columns = normalize_inputs(xyz, dimensions, self.inputs, self.mean, self.scale)
-        batches = Batches(xyz, self.configuration.points, self.spacing, columns)
+        batches = Batches(xyz, self.configuration.points, self.spacing, columns, self.reach)
         fitting = int(request.memory_mb / self.configuration.memory_mb(len(self.inputs)))
         side_by_side = max(1, min(resolve_threads(request.threads), fitting))
         apply = self._apply_on(request.device)  # once, before there are threads

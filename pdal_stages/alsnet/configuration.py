@@ -19,6 +19,9 @@ from ..base import checks
 from ..base.errors import OptionError
 from ..base.options import Settings, setting
 
+#: Farthest point a batch takes by default, in spacings. A batch of full size in even density has
+#: 1.13, in the corner of a cloud 2.26.
+REACH = 1.5
 _FILE = json.loads(resources.files(__package__).joinpath("networks.json").read_text("utf-8"))
 
 
@@ -126,6 +129,10 @@ class NetworkOptions(Settings):
     configuration: Any = "small"  #: a name of networks.json, or one of your own
     spacing: float | None = setting(
         None, "number", "Spacing of batches, m; default: four a point", 0.01, 1e5
+    )
+    #: batches are the nearest points up to here; 4 holds a full one in a corner of an even cloud
+    reach: float = setting(
+        REACH, "number", "Farthest point of a batch, in spacings of the grid", 1.0, 20.0
     )
     coordinates: str = setting(
         "Z", "string", "Coordinates used as inputs", choices=("", "Z", "XYZ")

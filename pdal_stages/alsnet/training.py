@@ -95,7 +95,7 @@ class NetworkTraining:
         start_from = None if start is None else start[1]
         self.data = data = TrainingData(clouds, options, names, start_from)
         count = data.count_trained()
-        self.selected = select_batches(
+        self.selected, self.added = select_batches(
             data.batches, data.train_labels, data.n_classes, network.histogram_threshold
         )
         self.held_batches = cover(data.batches, data.held_labels >= 0)
@@ -127,6 +127,7 @@ class NetworkTraining:
             data.scale,
             data.spacing,
             data.n_classes,
+            self.options.reach,
         )
 
     def _run_epoch(self, bar: Progress) -> None:
@@ -241,7 +242,11 @@ class NetworkTraining:
         start = start and os.path.basename(start)
         return {
             "network": {**options, "spacing": data.spacing, "start_from": start},
-            "batches": {"all": len(data.batches), "chosen": len(self.selected)},
+            "batches": {
+                "all": len(data.batches),
+                "chosen": len(self.selected),
+                "added_for_classes": self.added,
+            },
             "epochs": len(self.curve),
             "best_epoch": self.best_epoch,
             "points_held_out": int(np.count_nonzero(data.held_labels >= 0)),

@@ -15,14 +15,15 @@ from ..classifier.sampling import Folds
 from ..classifier.training_clouds import TrainingCloud, label_classes
 from ..classifier.training_options import TrainingOptions
 from ..features.cell_means import density
-from .batches import REACH, Batches, Pyramid, spacing_for
+from .batches import Batches, Pyramid, spacing_for
 from .classifier import AlsNet, make_pyramid, normalize_inputs
+from .configuration import REACH
 
 #: An input whose standard deviation is lower is not divided by it.
 _LEAST_DEVIATION = 1e-6
-#: Spacings between two clouds that are joined. A batch's points lie within `REACH` of its grid
-#: point, so more than two of these would do.
-_APART = 8.0 * REACH
+#: Reaches of a batch between two clouds that are joined. Its points lie within one of its grid
+#: point, so more than two would do.
+_APART = 8.0
 
 
 class TrainingData:
@@ -55,7 +56,9 @@ class TrainingData:
         points = self.configuration.points
         dense = float(np.median([density(xyz) for xyz in parts]))
         self.spacing = network.spacing or spacing_for(points, dense)  #: of the batches, meters
-        self.xyz = join_clouds(parts, self.spacing)  #: (n, 3) meters; the clouds lie side by side
+        self.xyz = join_clouds(
+            parts, self.spacing, network.reach
+        )  #: (n, 3) meters; the clouds lie side by side
         #: (n, inputs) normalized
         self.columns = normalize_inputs(self.xyz, values, inputs, self.mean, self.scale)
         held = hold_out(
@@ -64,7 +67,7 @@ class TrainingData:
         #: (n,) class positions that are trained on, and those on the ground held out; -1 elsewhere
         self.train_labels = np.where(held, -1, self.position).astype(np.int64)
         self.held_labels = np.where(held, self.position, -1).astype(np.int64)
-        self.batches = Batches(self.xyz, points, self.spacing, self.columns)
+        self.batches = Batches(self.xyz, points, self.spacing, self.columns, network.reach)
 
     def count_trained(self) -> npt.NDArray[np.int64]:
         """Return the points of each class that are trained on; OptionError where there are none."""
@@ -116,7 +119,7 @@ def _mean_and_scale(
 
 
 def join_clouds(
-    clouds: Sequence[npt.NDArray[np.float64]], spacing: float
+    clouds: Sequence[npt.NDArray[np.float64]], spacing: float, reach: float = REACH
 ) -> npt.NDArray[np.float64]:
     """Join clouds, moved along x by whole spacings so that no batch holds points of two."""
     out: list[npt.NDArray[np.float64]] = []
@@ -125,7 +128,7 @@ def join_clouds(
         if len(xyz):
             steps = 0.0 if right is None else np.ceil((right - xyz[:, 0].min()) / spacing)
             xyz = xyz + np.array([steps * spacing, 0.0, 0.0])
-            right = float(xyz[:, 0].max()) + _APART * spacing
+            right = float(xyz[:, 0].max()) + _APART * reach * spacing
         out.append(xyz)
     return np.concatenate(out)
 
@@ -143,21 +146,22 @@ def histogram_deviation(histogram: npt.NDArray[Any]) -> float:
 
 def select_batches(
     batches: Batches, labels: npt.NDArray[Any], n_classes: int, threshold: float
-) -> list[int]:
-    """Return the numbers of batches with a variety of classes [WM19 4.1].
+) -> tuple[list[int], int]:
+    """Return the numbers of batches with a variety of classes, and how many were added to them.
 
-    Where that leaves a class without any batch, the most mixed one that has it is taken too. Labels
-    (n,) are class positions; -1 is not looked at.
+    Where the variety [WM19 4.1] leaves a class without any batch, the most mixed one that has it is
+    added. Labels (n,) are class positions; -1 is not looked at.
     """
     parts = (labels[batches.members(number)] for number in range(len(batches)))
     histograms = [np.bincount(part[part >= 0], minlength=n_classes) for part in parts]
     spreads = [histogram_deviation(histogram) for histogram in histograms]
     chosen = {number for number, value in enumerate(spreads) if value < threshold}
+    mixed = len(chosen)
     for position in range(n_classes):
         having = [number for number, histogram in enumerate(histograms) if histogram[position]]
         if having and not chosen.intersection(having):
             chosen.add(min(having, key=lambda number: spreads[number]))
-    return sorted(chosen)
+    return sorted(chosen), len(chosen) - mixed
 
 
 def hold_out(

@@ -123,6 +123,16 @@ class PointEstimator(Estimator, Protocol):
         """Yield blocks of probabilities, with each row wanted once."""
 
 
+@runtime_checkable
+class BatchEstimator(PointEstimator, Protocol):
+    """An estimator that looks at parts of a cloud, one at once."""
+
+    def batches(
+        self, xyz: npt.NDArray[np.float64]
+    ) -> Iterator[tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]]:
+        """Yield center (2,) and rows (k,) of each part of points (n, 3), in meters."""
+
+
 class Trainer(Protocol):
     """What trains one kind; `options` are :class:`.training_options.TrainingOptions`."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
@@ -23,6 +23,7 @@ from .auto_context import WeightedPass, classify, plan_of
 from .feature_forest import FeatureEstimator
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
 from .interface import (
+    BatchEstimator,
     Estimator,
     InputPlan,
     PointEstimator,
@@ -120,6 +121,15 @@ class Model:
     def gives_variance(self) -> bool:
         """True for a network, which sees each point in several batches."""
         return isinstance(self.passes[0], PointEstimator)
+
+    def batches(
+        self, xyz: npt.NDArray[np.float64]
+    ) -> Iterable[tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]]:
+        """Return centers (2,) and rows (k,) of a network's batches of points (n, 3), in meters.
+
+        Others have none.
+        """
+        return self.algorithm.batches(xyz) if isinstance(self.algorithm, BatchEstimator) else ()
 
     @property
     def algorithm_versions(self) -> dict[str, int]:

@@ -357,8 +357,9 @@ RECIPES: dict[str, dict[str, Any]] = {
         "voxel": 0,  # every point by itself
         "alsnet": {  # 3, 4.1 (no batch is left out of Vaihingen, 4.2: histogram_threshold 100)
             "configuration": "alsnet4",
+            "reach": 4,  # 3 the nearest 200,000 points: not cut off at the default 1.5 spacings
             "coordinates": "",
-            "learning_rate": 0.001,
+            "learning_rate": 0.001,  # not stated; falls to 1 % of it, which is not stated either
             "batches_per_step": 1,
             "class_weights": "none",
             "histogram_threshold": 20,

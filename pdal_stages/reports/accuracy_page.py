@@ -100,12 +100,8 @@ def write_accuracy_report(
 def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
     """Return maps of reference, prediction and errors; none of points at one place or in a line."""
     points = np.asarray(place.xyz, dtype=np.float64)
-    true, labels = place.reference, place.predicted
-    target_of = np.arange(1 << 16)
-    target_of[list(a.merged)] = list(a.merged.values())
-    compared = np.isin(target_of[true], a.classes) & ~np.isin(true, list(a.left_out))
-    true, labels = target_of[true], target_of[labels]
-    wrong = compared & (true != labels)
+    compared, wrong = a.verdicts(place.reference, place.predicted)
+    true, labels = a.merge(place.reference), a.merge(place.predicted)
     width, height = np.ptp(points[:, :2], axis=0)
     n = int(compared.sum())
     out: dict[str, Any] = {"points": len(points), "compared": n, "maps": []}

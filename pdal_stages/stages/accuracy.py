@@ -143,6 +143,8 @@ class AccuracyStage(Stage):
                 if len(each) > 1:
                     named = zip(parts, each, strict=True)
                     written["files"] = [{"name": name, **summary(a)} for (name, _), a in named]
+                if batches := self._batches(parts, sides, accuracy):
+                    written["batches"] = batches
                 files[0].write_bytes((json.dumps(written, indent=1) + "\n").encode())
             if self.html:
                 self._write_page(files[-1], parts, sides, accuracy, rule)
@@ -154,6 +156,27 @@ class AccuracyStage(Stage):
             "mean_class_recall": accuracy.mean_class_recall,
             "mean_class_precision": accuracy.mean_class_precision,
         }
+
+    def _batches(
+        self, parts: Sequence[tuple[str, Points]], sides: Sequence[Sides], accuracy: Accuracy
+    ) -> list[dict[str, Any]]:
+        """Return the accuracy within each batch of a network, at its center [WM19 Figure 3]."""
+        out: list[dict[str, Any]] = []
+        if not self.model_file:
+            return out
+        model = loaded_model(self.model_file)
+        for (name, points), side in zip(parts, sides, strict=True):
+            compared, right = np.zeros((2, len(points.xyz)), bool)
+            compared[side.inside], wrong = accuracy.verdicts(side.reference, side.predicted)
+            right[side.inside] = ~wrong
+            right &= compared
+            for center, rows in model.batches(points.xyz):
+                if count := int(compared[rows].sum()):
+                    x, y = (center / points.units.horizontal).tolist()
+                    share = int(right[rows].sum()) / count
+                    place = {"x": x, "y": y, "points": count, "overall_accuracy": share}
+                    out.append({"name": name, **place} if name else place)
+        return out
 
     def _sides(self, points: Points) -> Sides:
         """Return the classes of both sides, of the points that are compared."""
