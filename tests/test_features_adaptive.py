@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdal_stages.features import compute_features
-from pdal_stages.features.adaptive import curvature_threshold, radii_of
 from pdal_stages.features.engine import FeatureEngine
 from pdal_stages.features.moments import M
 from pdal_stages.features.plan import FeaturePlan
+from pdal_stages.features.searches import curvature_threshold, radii_of
 
 CHECKED = [*oracle.COVARIANCE, *oracle.GEOMETRIC]
 

@@ -42,8 +42,8 @@ from tables import choose, spread, table, values
 
 from pdal_stages.accuracy.measures import Accuracy
 from pdal_stages.features import FeaturePlan
-from pdal_stages.features.adaptive import curvature_threshold
 from pdal_stages.features.neighborhoods import RADIUS_MEMBERS
+from pdal_stages.features.searches import curvature_threshold
 
 CLASSES = {2: "Ground", 5: "Vegetation", 6: "Facade", 14: "Wire", 15: "Pole/trunk"}
 SIX = ("Verticality", "HeightRange", "Linearity", "Planarity", "Scattering", "SurfaceVariation")

@@ -3,10 +3,8 @@
 All are chosen among nested ones, made of a query's neighbors in the order of distance, whose
 moments are summed up once. The k nearest are the point and its k nearest: n = k + 1 members, as in
 Weinmann et al. 2015. ``kopt`` takes the k, ``ropt`` the radius with the lowest eigenentropy,
-``rdim`` the radius with the lowest entropy of dimensionality. ``copt`` looks at the curvature
-(surface variation) of the sphere of 1 m first: where it is at least c_t the point is *scattered*
-and takes the best k of 10..50 within 3 m, otherwise it is *regular* and takes the best radius of
-0.5..2 m [H17]. The threshold c_t follows from the curvatures of the whole cloud.
+``rdim`` the radius with the lowest entropy of dimensionality, ``copt`` either by the curvature
+(:mod:`.searches`).
 
 A candidate needs members that do not all coincide: three of them where k is chosen
 (``moments.STRUCTURE_MEMBERS``), ten where a radius is (``neighborhoods.RADIUS_MEMBERS``). Where
@@ -30,6 +28,7 @@ from .nearest_neighbors import (
     LEAST2,
     MORE,
     ROOM,
+    Near,
     Wanted,
     build_tree,
     gather_near,
@@ -38,10 +37,10 @@ from .nearest_neighbors import (
     sort_near,
 )
 from .neighbor_surfaces import COLUMNS, UP, S, agreement
-from .neighborhoods import AROUND, COPT_REACH, RADIUS_MEMBERS
-from .plan import Columns, FeaturePlan, columns_of
+from .neighborhoods import AROUND, RADIUS_MEMBERS
+from .plan import FeaturePlan, columns_of
 from .point_grid import CellGrid
-from .registry import SURFACE_FEATURES, rows_of
+from .registry import SURFACE_FEATURES
 from .scale_selection import (
     add_up,
     eigenvalues_of,
@@ -49,78 +48,22 @@ from .scale_selection import (
     lowest_entropy,
     write_moments,
 )
+from .searches import (
+    CHOICE,
+    CURVATURE_RADIUS,
+    SCATTERED,
+    Search,
+    search_of_curvature,
+    search_of_numbers,
+    searches_for,
+)
 from .shape_distributions import Axes, Fitted, NeighborhoodGroup, Shapes, write_shapes
-
-#: Radius of the sphere whose curvature is looked at, meters [H17]. One of the radii of COPT_RADII:
-#: :func:`_curvature` takes it from among them.
-CURVATURE_RADIUS = 1.0
-#: Curvature of a point with too few neighbors [H17].
-SCATTERED = 1.0 / 3.0
-
-#: ``copt``: first and last radius and step of regular points, meters [H17].
-COPT_RADII = (0.5, 2.0, 0.05)
-#: ``copt``: fewest and most neighbors of scattered points [H17].
-COPT_K = (10, 50)
 
 #: For searches that need neither bins nor a threshold.
 NOTHING_FITTED = Fitted()
 
 #: Queries computed at a time for a whole cloud; see ``engine.MOST_ROWS``.
 CHUNK = 4096
-
-#: Columns of :attr:`Search.choices`: the first candidate among radii and ks, the one behind the
-#: last, and the members that a candidate needs.
-CHOICE = rows_of("first", "end", "members")
-
-
-def radii_of(first: float, last: float, step: float) -> np.ndarray:
-    """Return the radii first, first + step, ... up to `last`, rounded to nanometers.
-
-    >>> radii_of(0.25, 0.4, 0.05).tolist()
-    [0.25, 0.3, 0.35, 0.4]
-    """
-    count = math.floor((last - first) / step + 1e-9) + 1
-    return np.round(first + step * np.arange(count), 9)
-
-
-def curvature_threshold(curvatures: np.ndarray) -> float:
-    """Return the curvature from which on a point is scattered [H17 eq. 1-3].
-
-    ValueError where `curvatures` (n,) are not all finite, or n is 0.
-
-    Two means, started at the smallest and the largest value, give the centers cur1 and cur2 of two
-    groups of n1 and n2 = n - n1 values; c_t = cur1 + (cur2 - cur1) n2 / n. Where all values are
-    equal that is the value, and all points are scattered, which needs no radius to hold enough
-    points.
-    """
-    values = np.sort(np.asarray(curvatures, dtype=np.float64).ravel())
-    n = len(values)
-    if not n or not np.isfinite(values[-1]) or not np.isfinite(values[0]):
-        raise ValueError("curvatures must be finite numbers, at least one")
-    sums = np.concatenate(([0.0], np.cumsum(values)))
-    low, high = values[0], values[-1]
-    split = -1
-    while low < high:
-        before, split = split, int(np.searchsorted(values, 0.5 * (low + high), side="right"))
-        split = min(max(split, 1), n - 1)
-        if split == before:
-            break
-        low, high = sums[split] / split, (sums[n] - sums[split]) / (n - split)
-    return float(low + (high - low) * (n - split) / n) if low < high else float(low)
-
-
-class Search(NamedTuple):
-    """Neighborhoods that one search serves, as kernels take them."""
-
-    numbers: np.ndarray  # (n,) int64: which of a plan's
-    radii: np.ndarray  # (r,) float64, ascending, meters
-    ks: np.ndarray  # (k,) int64: neighbors besides the point itself, ascending
-    within2: float  # all points within this squared distance are wanted
-    cap2: float  # and of those within this one as many as the last of `ks` says
-    choices: np.ndarray  # (n, 3) int64: columns as in CHOICE
-    curved: bool = False  # copt: radii where the point is regular, ks where it is scattered
-    threshold: float = math.nan  # curvature from which on a point is scattered
-    by_dimensionality: bool = False  # rdim: the lowest entropy of dimensionality is taken
 
 
 class Results(NamedTuple):
@@ -148,7 +91,7 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         super().__init__([c for c in plan.layout if c.at and not c.neighborhood.fixed])
         self.grid, self.halo_m = grid, plan.halo_m
         self.surface_columns = columns_of(self.chosen, SURFACE_FEATURES)
-        self.searches = _searches(self.chosen)
+        self.searches = searches_for([columns.neighborhood for columns in self.chosen])
         self.tree = build_tree(grid.x, grid.y, grid.z)
         self._surfaces = np.zeros((0, len(S)), np.float32)
         if (self.surface_columns >= 0).any():
@@ -157,7 +100,7 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
     def _make_surfaces(self, threads: int | None) -> np.ndarray:
         """Return the surface of every point of the cloud, (n, S) float32."""
         surfaces = np.empty((len(self.grid.order), len(S)), np.float32)
-        nearest = _by_number({0: (AROUND, AROUND)})
+        nearest = search_of_numbers({0: (AROUND, AROUND)})
 
         def fill_part(part: slice) -> None:
             points, out = self._part(part), surfaces[part]
@@ -180,9 +123,7 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
     def curvatures(self, threads: int | None = None) -> np.ndarray:
         """Return the curvature of the cloud's points, in the order of the grid, (n,) [H17]."""
         curvatures = np.empty(len(self.grid.order))
-        none, radius = np.zeros(0, np.int64), np.array([CURVATURE_RADIUS])
-        choices, within2 = np.zeros((0, 3), np.int64), CURVATURE_RADIUS * CURVATURE_RADIUS
-        search = Search(none, radius, none, within2, within2, choices, True)
+        search = search_of_curvature()
         self._for_all(
             lambda part: self.choose(search, self._part(part), curvature=curvatures[part]), threads
         )
@@ -229,48 +170,16 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         return results.table
 
 
-def _by_number(ranges: dict[int, tuple[int, int]]) -> Search:
-    """Return one search for ranges of numbers of neighbors, by the neighborhood's number."""
-    all_ks = {k for first, last in ranges.values() for k in range(first, last + 1)}
-    ks = np.array(sorted(all_ks), np.int64)
-    choices = [
-        [np.searchsorted(ks, first), np.searchsorted(ks, last) + 1, STRUCTURE_MEMBERS]
-        for first, last in ranges.values()
-    ]
-    numbers = np.array(list(ranges), np.int64)
-    return Search(numbers, np.zeros(0), ks, 0.0, math.inf, np.array(choices, np.int64))
-
-
-def _searches(chosen: list[Columns]) -> list[Search]:
-    """Return the searches for adaptive neighborhoods: one for all numbers of neighbors first."""
-    ranges, searches = {}, []
-    for number, columns in enumerate(chosen):
-        neighborhood = columns.neighborhood
-        if neighborhood.reach is None:
-            ranges[number] = int(neighborhood.parameters[0]), int(neighborhood.parameters[-1])
-            continue
-        radii = radii_of(*(neighborhood.parameters or COPT_RADII))
-        within2 = float(radii[-1] * radii[-1])
-        choices = np.array([[0, len(radii), RADIUS_MEMBERS]], np.int64)
-        ks, numbers = np.zeros(0, np.int64), np.array([number], np.int64)
-        search = Search(numbers, radii, ks, within2, within2, choices)
-        if neighborhood.kind == "copt":
-            ks = np.arange(COPT_K[0], COPT_K[1] + 1)
-            search = search._replace(ks=ks, cap2=COPT_REACH * COPT_REACH, curved=True)
-        elif neighborhood.kind == "rdim":
-            search = search._replace(by_dimensionality=True)
-        searches.append(search)
-    return ([_by_number(ranges)] if ranges else []) + searches
-
-
 # ---- kernels ---------------------------------------------------------------------------------
 
 
-class Scratch(NamedTuple):
+class Buffers(NamedTuple):
     """Arrays that are used again for every query."""
 
-    sums: np.ndarray  # (MOMENTS + 1, candidates) float64
-    ends: np.ndarray  # (candidates,) int64: members of each candidate
+    near: Near  # candidates for neighbors, and a query's neighbors in the order of distance
+    record: np.ndarray  # (candidates, 4) float32: offsets of members, for shapes
+    sums: np.ndarray  # (MOMENTS + 1, choices) float64: moments of each nested neighborhood
+    ends: np.ndarray  # (choices,) int64: members of each
 
 
 @njit
@@ -290,20 +199,15 @@ def adaptive_block(tree, points, search, surfaces, shapes, results):
         too few); curvatures; shapes and features of surfaces.
     """
     qx, qy, qz = points
-    queries, need = make_groups(qx, qy, qz), _wanted(tree, search).need
-    near = make_near(CROWD * need + ROOM)
-    candidates = len(search.radii) + len(search.ks)
-    scratch = Scratch(np.empty((MOMENTS + 1, candidates)), np.zeros(candidates, np.int64))
-    record = np.empty((0, 4), np.float32)
-    done = 0
-    while True:
-        if shapes is not None:
-            record = np.empty((len(near.x), 4), np.float32)
-        buffers = near, record, scratch
+    queries, room = make_groups(qx, qy, qz), CROWD * _wanted(tree, search).need + ROOM
+    nested, done = len(search.radii) + len(search.ks), 0
+    while done < len(qx):
+        near = make_near(room)
+        record = np.empty((len(near.x) if shapes is not None else 0, 4), np.float32)
+        sums, ends = np.empty((MOMENTS + 1, nested)), np.zeros(nested, np.int64)
+        buffers = Buffers(near, record, sums, ends)
         done = _serve_groups(tree, queries, search, surfaces, shapes, results, buffers, done)
-        if done == len(qx):
-            return
-        near = make_near(4 * len(near.x))
+        room = 4 * len(near.x)
 
 
 @device(forceinline=True)
@@ -316,8 +220,7 @@ def _wanted(tree, search):
 @device
 def _serve_groups(tree, queries, search, surfaces, shapes, results, buffers, done):
     """Serve the queries from order[done] on; return up to where there is room for candidates."""
-    near, record, scratch = buffers
-    wanted = _wanted(tree, search)
+    wanted, near = _wanted(tree, search), buffers.near
     need, within2, cap2 = wanted.need, wanted.within2, wanted.cap2
     starts, guess = queries.starts, FIRST2
     for group in range(np.searchsorted(starts, done, "right") - 1, len(starts) - 1):
@@ -335,32 +238,41 @@ def _serve_groups(tree, queries, search, surfaces, shapes, results, buffers, don
                     reach2 = min(2.0 * reach2, cap2)
                     break
                 lo += 1
-                sum_candidates(near, count, point, search, scratch)
                 if need and count:
                     farthest2 = max(farthest2, near.sorted[min(count, need) - 1])
-                if search.curved:
-                    results.curvature[q] = _curvature(scratch.sums, search)
-                for j in range(len(search.numbers)):
-                    best = _choose(
-                        search, j, results.curvature[q] if search.curved else 0.0, scratch
-                    )
-                    _write_reach(near, count, search, (j, best), scratch, results.table[j], q)
-                    number, members = search.numbers[j], scratch.ends[best]
-                    if len(surfaces.values):
-                        columns = surfaces.columns[number]
-                        beyond = agreement(surfaces.values, near, members, columns, results.out[q])
-                        results.table[j, M.REACH, q] = max(results.table[j, M.REACH, q], beyond)
-                    if shapes is not None and shapes.shaped[number]:
-                        centroid = _record_members(near, members, point, scratch.sums, best, record)
-                        write_shapes(shapes, number, q, record, members, centroid, results.out)
+                _serve_query(q, point, count, search, surfaces, shapes, results, buffers)
         guess = max(MORE * farthest2, LEAST2)
     return len(queries.x)
 
 
 @device(forceinline=True)
-def sum_candidates(near, count, point, search, scratch):
-    """Find the members of each candidate among the first `count` neighbors, and their moments."""
-    radii, ks, ends = search.radii, search.ks, scratch.ends
+def _serve_query(q, point, count, search, surfaces, shapes, results, buffers):
+    """Choose among the nested neighborhoods of a query, and write what is made of the best."""
+    near, record, sums, ends = buffers
+    sum_nested(count, point, search, buffers)
+    curvature = 0.0
+    if search.curved:
+        curvature = _curvature(sums, search)
+        results.curvature[q] = curvature
+    for j in range(len(search.numbers)):
+        best = _choose(search, j, curvature, buffers)
+        table, number, members = results.table[j], search.numbers[j], ends[best]
+        write_moments(sums, best, table, q)
+        table[M.RADIUS, q], table[M.REACH, q] = _radius_and_reach(search, j, best, count, buffers)
+        if len(surfaces.values):
+            columns = surfaces.columns[number]
+            beyond = agreement(surfaces.values, near, members, columns, results.out[q])
+            table[M.REACH, q] = max(table[M.REACH, q], beyond)
+        if shapes is not None and shapes.shaped[number]:
+            centroid = _record_members(members, point, best, buffers)
+            write_shapes(shapes, number, q, record, members, centroid, results.out)
+
+
+@device(forceinline=True)
+def sum_nested(count, point, search, buffers):
+    """Find the members of each nested neighborhood among `count` neighbors, and their moments."""
+    near, _, sums, ends = buffers
+    radii, ks = search.radii, search.ks
     shells, i = len(radii), 0
     for e in range(shells):
         while i < count and near.sorted[i] <= radii[e] * radii[e]:
@@ -368,8 +280,8 @@ def sum_candidates(near, count, point, search, scratch):
         ends[e] = i
     for e in range(len(ks)):
         ends[shells + e] = min(ks[e] + 1, count)
-    add_up(near, point, ends, 0, shells, scratch.sums)
-    add_up(near, point, ends, shells, len(ends), scratch.sums)
+    add_up(near, point, ends, 0, shells, sums)
+    add_up(near, point, ends, shells, len(ends), sums)
 
 
 @device
@@ -386,36 +298,34 @@ def _curvature(sums, search):
 
 
 @device
-def _choose(search, j, curvature, scratch):
-    """Return the best candidate for the neighborhood number `j` of a search."""
+def _choose(search, j, curvature, buffers):
+    """Return the best nested neighborhood for number `j` of a search."""
     first, end = search.choices[j, CHOICE.first], search.choices[j, CHOICE.end]
     members = search.choices[j, CHOICE.members]
     if search.curved and curvature >= search.threshold:
-        first, end, members = len(search.radii), len(scratch.ends), STRUCTURE_MEMBERS
+        first, end, members = len(search.radii), len(buffers.ends), STRUCTURE_MEMBERS
     if search.by_dimensionality:
-        return lowest_dimensionality(scratch.sums, first, end, members)
-    return lowest_entropy(scratch.sums, first, end, members)
+        return lowest_dimensionality(buffers.sums, first, end, members)
+    return lowest_entropy(buffers.sums, first, end, members)
 
 
 @device(forceinline=True)
-def _write_reach(near, count, search, choice, scratch, table, q):
-    """Write moments and radius of the chosen candidate, and how far away points matter to it."""
-    j, best = choice
-    shells, n = len(search.radii), scratch.ends[best]
-    write_moments(scratch.sums, best, table, q)
-    table[M.REACH, q] = 0.0
+def _radius_and_reach(search, j, best, count, buffers):
+    """Return the radius of the best neighborhood, and how far away points matter to the choice."""
+    near, shells, n = buffers.near, len(search.radii), buffers.ends[best]
     if best < shells:
-        table[M.RADIUS, q] = search.radii[best]
-        return
-    table[M.RADIUS, q] = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
-    if not search.curved:
-        k = search.ks[search.choices[j, CHOICE.end] - 1 - shells]
-        table[M.REACH, q] = math.sqrt(near.sorted[k]) if k < count else math.inf
+        return search.radii[best], 0.0
+    radius = math.sqrt(near.sorted[n - 1]) if n > 0 else 0.0
+    if search.curved:
+        return radius, 0.0
+    k = search.ks[search.choices[j, CHOICE.end] - 1 - shells]
+    return radius, math.sqrt(near.sorted[k]) if k < count else math.inf
 
 
 @device
-def _record_members(near, count, point, sums, best, record):
+def _record_members(count, point, best, buffers):
     """List the offsets of the members from the query for pulls; return their centroid."""
+    near, record, sums, _ = buffers
     x, y, z = point
     for i in range(count):
         p = near.pos[i]

@@ -437,7 +437,7 @@ def _fit(
     if (needs_copt or needs_bins) and not any(len(np.asarray(cloud)) for cloud in clouds):
         raise StageError("the cloud has no points to fit shape thresholds or copt to")
     if needs_copt:
-        from .adaptive import curvature_threshold
+        from .searches import curvature_threshold
 
         each = [engine_of(number).curvatures() for number in range(len(clouds))]
         threshold = curvature_threshold(np.concatenate(each))
