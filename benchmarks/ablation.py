@@ -47,10 +47,12 @@ from surveys import GROUND, SURVEYS, VEGETATION
 from pdal_stages.structures import decks, wires
 from pdal_stages.terrain import (
     detached_noise,
+    filter_options,
     filtered_ground,
     low_outliers,
     noise,
     openings,
+    regain,
     smrf,
     wide_roofs,
 )
@@ -277,12 +279,12 @@ ROWS: dict[str, dict[str, Row]] = {
             low_outliers, min_support=-1, min_support_share=0.0
         ),
         "holes stay holes": Row(openings, "fill_holes", unchanged),
-        "without regaining ground": Row(smrf, "ROUNDS", 0),
-        "regained once": Row(smrf, "ROUNDS", 1),
-        "regained near the surface only": Row(smrf, "SPREADS", 0),
-        "among a fifth of ground": Row(smrf, "SPREAD_SHARE", 0.2),
-        "among three tenths of ground": Row(smrf, "SPREAD_SHARE", 0.3),
-        "surface of 8 m blocks": Row(smrf, "NEAR", 8.0),
+        "without regaining ground": Row(regain, "ROUNDS", 0),
+        "regained once": Row(regain, "ROUNDS", 1),
+        "regained near the surface only": Row(regain, "SPREADS", 0),
+        "among a fifth of ground": Row(regain, "SPREAD_SHARE", 0.2),
+        "among three tenths of ground": Row(regain, "SPREAD_SHARE", 0.3),
+        "surface of 8 m blocks": Row(filter_options, "NEAR", 8.0),
         "without wide roofs": Row(smrf, "level_below_roofs", no_wide_roofs),
         **{
             f"wide roofs: {share:.0%} of an outline are steps": Row(
@@ -352,7 +354,7 @@ def errors_of(what: str, every: dict[str, Cloud], only: list[str]) -> dict[str, 
         if only and words not in (*only, "as it is"):
             continue
         began = time.process_time()
-        module, value = (row.module, row.value) if row.module else (smrf, smrf.ROUNDS)
+        module, value = (row.module, row.value) if row.module else (regain, regain.ROUNDS)
         with changed(module, row.name if row.module else "ROUNDS", value):
             errors[words] = {name: score(at, **row.options) for name, at in inputs.items()}
         print(f"{words}: {time.process_time() - began:.0f} CPU s", file=sys.stderr, flush=True)

@@ -13,8 +13,9 @@ from pdal_stages.cli import main
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.pipeline.json_source import parse_overrides
 from pdal_stages.stages.registry import stage_from
+from pdal_stages.terrain.filter_options import FilterOptions
 from pdal_stages.terrain.heights import filtered_ground
-from pdal_stages.terrain.smrf import FilterOptions
+from pdal_stages.terrain.smrf import reach_of_given
 
 DATA = Path(__file__).parent / "data"
 OPTIONS = FilterOptions(openings=(5, 17))
@@ -70,7 +71,7 @@ def test_points_as_far_as_its_reach_decide():
     xyz, codes = clip("woods")
     whole = filtered_ground(xyz, ground=codes == 2, openings=(5, 17))
     middle = np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20
-    near = np.flatnonzero(np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20 + OPTIONS.reach_of_given)
+    near = np.flatnonzero(np.abs(xyz[:, 0] - np.median(xyz[:, 0])) < 20 + reach_of_given(OPTIONS))
     assert len(near) < 0.9 * len(xyz)
     near = np.random.default_rng(0).permutation(near)
     part = filtered_ground(xyz[near], ground=codes[near] == 2, openings=(5, 17))

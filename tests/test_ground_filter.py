@@ -16,8 +16,9 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.grid import GridWindow
 from pdal_stages.stages.hag_morphological import HagMorphological
 from pdal_stages.terrain import filtered_ground, wide_roofs
+from pdal_stages.terrain.filter_options import FilterOptions
 from pdal_stages.terrain.openings import FILL_RINGS, fill_holes, growing_radii, objects_of
-from pdal_stages.terrain.smrf import FilterOptions
+from pdal_stages.terrain.smrf import reach_of_points
 from pdal_stages.terrain.surface import GroundRaster, planes_of_blocks
 
 SMALL = {"window": 12.0, "openings": (5, 9), "slope_too": True}
@@ -317,7 +318,7 @@ def test_a_tile_with_its_halo_gives_the_same_bits():
     origin = -47.0, -200.0
     x, y, z, _ = town(2, side=2150, density=0.06, origin=origin)  # larger than one raster
     options = {**SMALL, "window": 6.0}
-    halo = FilterOptions(window=6.0, openings=(5, 9)).reach_of_points
+    halo = reach_of_points(FilterOptions(window=6.0, openings=(5, 9)))
     whole = filtered_ground(x, y, z, **options)
     u, v = x - origin[0], y - origin[1]
     core = (u >= 595) & (u < 645) & (v >= 605) & (v < 665)
@@ -369,6 +370,21 @@ def test_degenerate_clouds(x, y, z):
     result = filtered_ground(x, y, z, **SMALL)
     assert np.allclose(result["HeightAboveGround"], 0, atol=1e-6)
     assert result["Ground"].all()
+
+
+def test_above_an_opening_but_far_from_ground():
+    """An opening reaches farther than the surface: the height above it is known, the other one 0."""
+    x, y = (axis.ravel().astype(float) for axis in np.mgrid[:300, :20])
+    far = 150.0
+    inside = np.append(x < 60, False)
+    result = filtered_ground(
+        np.append(x, 60 + far),
+        np.append(y, 9.0),
+        np.append(0.0 * x, 7.0),
+        mask=inside,
+        openings=(299,),
+    )
+    assert result["HeightAboveGround"][-1] == 0.0 and result["HeightAboveOpening_299"][-1] == 7.0
 
 
 def test_nothing_not_finite_and_nothing_usable():

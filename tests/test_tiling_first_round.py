@@ -10,6 +10,7 @@ from test_ground_filter import town
 import pdal_stages as ps
 from pdal_stages import run_tiled
 from pdal_stages.terrain import filtered_ground
+from pdal_stages.terrain.filter_options import FilterOptions
 from pdal_stages.terrain.ground_blocks import (
     BLOCK_SIDE,
     GroundCells,
@@ -17,7 +18,7 @@ from pdal_stages.terrain.ground_blocks import (
     reach_of_block,
     reduced_points,
 )
-from pdal_stages.terrain.smrf import FilterOptions
+from pdal_stages.terrain.smrf import reach_of_cells
 from pdal_stages.tiling import tiled_run as run
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
@@ -201,7 +202,7 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
     ):
         away = np.maximum(np.maximum(box[0] - u, u - box[2]), np.maximum(box[1] - v, v - box[3]))
         near = away <= 3.0
-        wide = 3.0 + options_values.reach_of_cells * cell
+        wide = 3.0 + reach_of_cells(options_values) * cell
         surroundings = [box[0] - wide, box[1] - wide, box[2] + wide, box[3] + wide]
         surroundings = [edge + origin[n % 2] for n, edge in enumerate(surroundings)]
         cells = blocks_of(np.array([x, y, z]), options_values, surroundings)

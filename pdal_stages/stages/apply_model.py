@@ -34,7 +34,7 @@ from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
-from ..terrain.smrf import FilterOptions
+from ..terrain.filter_options import FilterOptions
 from .base import Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
 from .points import LAS_DIMENSIONS, Points, class_counts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,10 @@ from numpy.typing import NDArray
 from ..base.asprs import TERRAIN
 from ..base.dimensions import GROUND, HEIGHT, SLOPE, Dimension, is_height, opening
 from ..base.errors import NoTerrainError
+from ..base.files import check_writable
+from ..base.geotiff import rasterio, write_geotiff
+from ..base.grid import GridWindow
+from ..terrain.filter_options import FilterOptions, Keep
 from ..terrain.ground_blocks import (
     BLOCK_SIDE,
     GroundCells,
@@ -18,7 +23,7 @@ from ..terrain.ground_blocks import (
     reduced_points,
 )
 from ..terrain.heights import filtered_ground
-from ..terrain.smrf import FilterOptions
+from ..terrain.smrf import reach_of_cells, reach_of_given, reach_of_points
 from .base import HEIGHTS_OUTSIDE, Blocks, FarReaching, StageContext, inside_block
 from .options import Selection, ignore_option, option
 from .points import Points
@@ -83,8 +88,19 @@ class HagMorphological(FarReaching):
         "that are as near to the surface as threshold and scalar say",
     )
 
+    keep_rasters: str | None = option(
+        "folder",
+        None,
+        "Write the raster that each step of the filter makes to GeoTIFF files in folders of this "
+        "one (extra raster)",
+    )
+
     def check(self) -> None:
-        """Refuse options that contradict each other."""
+        """Refuse options that contradict each other, and a folder that cannot be written."""
+        if self.keep_rasters is not None:
+            rasterio()
+            folder = Path(self.keep_rasters)
+            check_writable(folder / "x.tif" if folder.is_dir() else folder, "raster")
         self._filter = FilterOptions(
             **{name: self.options[name] for name in _FILTER}, slope_too=self.terrain_slope
         )
@@ -100,17 +116,16 @@ class HagMorphological(FarReaching):
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
-        if self.given_ground:
-            return self._filter.reach_of_given * self.cell
-        return self._filter.reach_of_points * self.cell
+        reach = reach_of_given if self.given_ground else reach_of_points
+        return reach(self._filter) * self.cell
 
     def blocks(self) -> Blocks | None:
         """Return the blocks of the raster; a point's height depends on cells alone."""
         if self.given_ground:
             return None
         cell = self.cell
-        reach = (reach_of_block(self._filter) + 2) * cell
-        return Blocks(BLOCK_SIDE * cell, reach, self._filter.reach_of_cells * cell, 2 * cell, cell)
+        reach = (reach_of_block(self._filter) + 1) * cell
+        return Blocks(BLOCK_SIDE * cell, reach, reach_of_cells(self._filter) * cell, 2 * cell, cell)
 
     def reduce_points(self, points: Points) -> dict[str, NDArray[np.float64]]:
         """Return the lowest points that blocks around need, and the points inside each block."""
@@ -129,7 +144,21 @@ class HagMorphological(FarReaching):
         block: tuple[int, int],
     ) -> dict[str, NDArray]:
         """Compute the cells of a block, in squares."""
-        return cells_of_block(far_points, block, self._filter, inside)
+        return cells_of_block(far_points, block, self._filter, inside, bool(self.keep_rasters))
+
+    def _write_rasters(self, points: Points) -> Keep | None:
+        """Return a function that writes rasters of steps to files, in the units of the points."""
+        if self.keep_rasters is None:
+            return None
+        folder, cell = Path(self.keep_rasters), self.cell / points.units.horizontal
+
+        def write(name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
+            file = f"{window.left}_{window.bottom}_{window.width}x{window.height}.tif"
+            corner = window.left * cell, window.bottom * cell
+            heights = (values / points.units.vertical).astype(np.float32)
+            write_geotiff(folder / name / file, heights, corner, cell, points.wkt)
+
+        return write
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Find the ground, or take the given one, and compute heights above it."""
@@ -146,7 +175,7 @@ class HagMorphological(FarReaching):
         columns = filtered_ground(
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
-            **vars(self._filter),
+            **{**vars(self._filter), "keep": self._write_rasters(points)},
             threads=self.threads,
             cells=None if context.blocks is None else GroundCells(context.blocks),
             figures=points.report.figures,

@@ -60,7 +60,7 @@ PDAL_OPTIONS: Mapping[str, tuple[Option, ...]] = {
 }
 #: Options on a stage's place in a pipeline, on how it is run and on the units of the points at
 #: hand; they do not change what it computes.
-_NOT_STORED = (*PDAL_OWN, "threads", "horizontal_unit", "vertical_unit")
+_NOT_STORED = (*PDAL_OWN, "threads", "horizontal_unit", "vertical_unit", "keep_rasters")
 #: Most characters of preprocessing as JSON; more is an attack on the reader's time.
 _MAX_CHARACTERS = 2000
 

@@ -7,25 +7,28 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.grid import GridWindow, cell_keys, cell_numbers, group_by_key
+from . import wide_roofs
 from .cells import HIGHEST, HOLE, lowest_points
+from .filter_options import FilterOptions, Keep
+from .minimum_grid import CellMeans, GroundPoints, ground_means
 from .openings import FILL_RINGS
 from .smrf import (
-    RIM,
-    WIDE_RIM,
-    CellMeans,
-    FilterOptions,
-    GroundPoints,
-    ground_means,
-    ground_raster,
+    GROUND_POINTS,
+    MINIMUM_GRID,
+    PROVISIONAL,
+    cell_steps,
+    ground_filter,
+    heights_of,
+    holes,
 )
-from .surface import GroundRaster, cells_around, heights_above, surface
-from .surface import reach as planes_reach
-from .wide_roofs import RULES as WIDE_ROOFS
+from .steps import Chain
+from .surface import GroundRaster
 from .wide_roofs import lowest_of_coarse_cells
 
 #: Side of a block in cells: larger ones take more memory, smaller ones more time; not tuned.
@@ -36,15 +39,22 @@ SQUARE_SIDE = 256
 
 def reach_of_block(options: FilterOptions) -> int:
     """Return how far around a block, in cells, lowest points matter."""
-    return options.reach + _reach_of_ground(options)
+    return ground_filter(options).reach(last=GROUND_POINTS)
 
 
-def _reach_of_ground(options: FilterOptions) -> int:
-    """Return how far around a block, in cells, it must be known which cells are ground.
+def _steps_of_block(options: FilterOptions) -> Chain:
+    """Return the steps up to the surface that tells which points of a block are ground."""
+    steps = ground_filter(options).steps
+    names = [step.name for step in steps]
+    return Chain(steps[: names.index(PROVISIONAL) + 1])
 
-    The provisional surface of its points is fitted through these.
-    """
-    return planes_reach(options.near_levels) + WIDE_RIM
+
+class KnownCells(NamedTuple):
+    """What an earlier round made of the cells of a window."""
+
+    raster: GroundRaster
+    means: CellMeans  #: of their ground points
+    kept: list[NDArray[np.float32]]  #: (h, w) what each step made, where that was kept
 
 
 @dataclass(frozen=True)
@@ -55,12 +65,14 @@ class GroundCells:
     #: `_record`. Saved ones are read when they are asked for, and not kept.
     blocks: Sequence[Mapping[str, NDArray[np.void]]]
 
-    def raster(self, window: GridWindow, radii: list[int]) -> tuple[GroundRaster, CellMeans]:
-        """Return the raster of a window, and the means of its ground points."""
-        shape, record = (window.height, window.width), _record(len(radii))
+    def raster(self, window: GridWindow, options: FilterOptions, kept: int = 0) -> KnownCells:
+        """Return what is known of the cells of a window; `kept` rasters of steps with it."""
+        radii, shape = options.requested_radii, window.shape
+        record = _record(len(radii), kept)
         out = {name: np.zeros((*shape, *record[name].shape), record[name].base) for name in _FILLED}
         out["lowest"][:] = out["floor"][:] = HOLE
         opened = {radius: np.full(shape, -np.inf, np.float32) for radius in radii}
+        steps = [np.full(shape, np.nan, np.float32) for _ in range(kept)]
         squares = _squares_of(window)
         for block in self.blocks:
             for name in squares.intersection(block):
@@ -69,10 +81,11 @@ class GroundCells:
                 at = cells["row"] - window.bottom, cells["column"] - window.left
                 for field, values in out.items():
                     values[at] = cells[field]
-                for k, values in enumerate(opened.values()):
-                    values[at] = cells["opened"][:, k]
+                for field, rasters in (("opened", opened.values()), ("kept", steps)):
+                    for k, values in enumerate(rasters):
+                        values[at] = cells[field][:, k]
         means = out.pop("held"), out.pop("means")
-        return GroundRaster(window, **out, opened=opened), means
+        return KnownCells(GroundRaster(window, **out, opened=opened), means, steps)
 
 
 #: Fields of a record that fill rasters of their own.
@@ -95,11 +108,11 @@ def _squares_of(window: GridWindow) -> set[str]:
     return {f"{i}_{j}" for i in columns for j in rows}
 
 
-def _record(openings: int) -> np.dtype:
+def _record(openings: int, kept: int) -> np.dtype:
     """Return the type of a cell's record.
 
-    The fields of a :class:`.surface.GroundRaster`, whether the cell holds ground points, and their
-    mean place.
+    The fields of a :class:`.surface.GroundRaster`, whether the cell holds ground points, their mean
+    place, and what steps made where that is kept.
     """
     return np.dtype(
         [
@@ -108,6 +121,7 @@ def _record(openings: int) -> np.dtype:
             *((name, np.bool_) for name in ("ground", "held")),
             *((name, np.float64, 3) for name in ("place", "means")),
             ("opened", np.float32, openings),
+            ("kept", np.float32, kept),
         ]
     )
 
@@ -139,47 +153,65 @@ def cells_of_block(
     block: tuple[int, int],
     options: FilterOptions,
     points: Iterable[NDArray[np.float64]] = (),
+    keep: bool = False,
 ) -> dict[str, NDArray[np.void]]:
-    """Compute the cells of one block of a :class:`GroundCells`, by column and row of the blocks.
+    """Compute the cells of a block: one of the blocks of a :class:`GroundCells`.
 
-    `outer` are the lowest points (n, 3) of :func:`reduced_points`: all within
-    :func:`reach_of_block` cells of the block, and few more. `points` are all that may be ground in
-    the block, in parts (n, 3).
+    Parameters
+    ----------
+    outer : (n, 3) float64
+        The lowest points of :func:`reduced_points`: all within :func:`reach_of_block` cells of the
+        block, and few more.
+    block : tuple of int
+        Column and row in a grid of blocks of `BLOCK_SIDE` cells.
+    options : FilterOptions
+    points : iterable of (m, 3) float64
+        All points that may be ground in the block, in parts.
+    keep : bool
+        Whether records hold what each step made.
     """
     core = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+    steps, classify = _steps_of_block(options), cell_steps(options)
+    wanted = core.padded(1)  # points blend the four cells around them
+    low = _in_cells(_thinned_far_away(outer, wanted, steps, options.cell), options)
     # Openings reach into cells without points.
-    spill = max([*options.requested_radii, 0]) + FILL_RINGS + RIM
-    margin = max(spill, _reach_of_ground(options))
-    low = _in_cells(_thinned_far_away(outer, core.padded(margin), options), options)
-    if not core.padded(margin).contains(low.column, low.row).any():
+    spill = max([*options.requested_radii, 0]) + FILL_RINGS + 2
+    near = wanted.padded(max(spill, steps.reach(classify.last, PROVISIONAL)))
+    if not near.contains(low.column, low.row).any():
         return {}
-    raster = ground_raster(low, options, margin=spill, wanted=core.padded(margin))
-    inside = low.take(core.contains(low.column, low.row))
-    needed = cells_around(raster.window, inside.column, inside.row)
-    planes = surface(raster, options.near_levels, needed)
-    # With a ring around: points blend the four cells around them.
-    kept = core.padded(1).intersect(raster.window)
-    raster, planes = raster.cut(kept), planes[kept.slices_in(raster.window)].copy()
-    means = ground_means(_judged(points, planes, kept, options), options.cell, kept)
-    return _in_squares(_records(raster, core, means, options.requested_radii))
+    window = GridWindow.enclosing(low.column, low.row).padded(spill)
+    kept: list[NDArray[np.float32]] = []
+    raster = steps.run(low, holes(window), wanted, _cut_into(kept, wanted) if keep else None)
+    means = ground_means(_judged(points, raster, options), options.cell, raster.window)
+    records = _records(raster, core, means, options.requested_radii, kept[: len(classify.steps)])
+    return _in_squares(records)
+
+
+def _cut_into(kept: list[NDArray[np.float32]], wanted: GridWindow) -> Keep:
+    """Return a function that adds the wanted cells of rasters to a list."""
+
+    def add(_: str, window: GridWindow, values: NDArray[np.float32]) -> None:
+        kept.append(values[wanted.intersect(window).slices_in(window)])
+
+    return add
 
 
 def _thinned_far_away(
-    lowest: NDArray[np.float64], wanted: GridWindow, options: FilterOptions
+    lowest: NDArray[np.float64], wanted: GridWindow, steps: Chain, cell: float
 ) -> NDArray[np.float64]:
     """Return the lowest points (n, 3) near wanted cells, and far away those of coarse cells alone.
 
     This halves the memory of a block.
     """
-    coarse = WIDE_ROOFS.cells_per_side(options.cell)
-    near = wanted.padded(options.reach_of_raster)
+    coarse = wide_roofs.RULES.cells_per_side(cell)
+    near = wanted.padded(steps.reach(MINIMUM_GRID, steps.last))
     left, bottom = near.left // coarse * coarse, near.bottom // coarse * coarse
     right, top = near.left + near.width, near.bottom + near.height
     inside = np.ones(len(lowest), bool)
     for axis, first, end in ((0, left, right), (1, bottom, top)):
-        number = cell_numbers(lowest[:, axis], options.cell)
+        number = cell_numbers(lowest[:, axis], cell)
         inside &= (number >= first) & (number < -(-end // coarse) * coarse)
-    far = lowest_of_coarse_cells(lowest[~inside], options.cell)
+    far = lowest_of_coarse_cells(lowest[~inside], cell)
     return np.concatenate([lowest[inside], far])
 
 
@@ -190,35 +222,37 @@ def _in_cells(xyz: NDArray[np.float64], options: FilterOptions) -> GroundPoints:
 
 
 def _judged(
-    parts: Iterable[NDArray[np.float64]],
-    planes: NDArray[np.float64],
-    window: GridWindow,
-    options: FilterOptions,
+    parts: Iterable[NDArray[np.float64]], raster: GroundRaster, options: FilterOptions
 ) -> Iterator[tuple[GroundPoints, NDArray[np.bool_]]]:
-    """Yield parts of points (n, 3), and which are ground by the planes (h, w, 3) of a window."""
+    """Yield parts of points (n, 3), and which are ground by the surface of a raster."""
     for xyz in parts:
         points = _in_cells(xyz, options)
-        height, gradient = np.empty((2, len(xyz)))
-        heights_above(*points[:3], options.cell, window[:2], planes, height, gradient)
-        yield points, options.is_ground(points.use, height, gradient)
+        above = heights_of(points, raster, options.cell, threads=1)
+        yield points, options.is_ground(points.use, *above)
 
 
 def _records(
-    raster: GroundRaster, core: GridWindow, means: CellMeans, radii: list[int]
+    raster: GroundRaster,
+    core: GridWindow,
+    means: CellMeans,
+    radii: list[int],
+    kept: list[NDArray[np.float32]],
 ) -> NDArray[np.void]:
     """Return the records (n,) of the cells of a raster that lie in the core and are not empty."""
     held, places = means
-    opened = np.empty((*raster.shape, len(radii)), np.float32)
-    for k, radius in enumerate(radii):
-        opened[..., k] = raster.opened[radius]
+    stacks = {
+        name: np.stack(rasters, axis=-1) if rasters else np.zeros((*raster.shape, 0), np.float32)
+        for name, rasters in (("opened", [raster.opened[r] for r in radii]), ("kept", kept))
+    }
     filled = np.zeros(raster.shape, bool)
     filled[core.intersect(raster.window).slices_in(raster.window)] = True
-    filled &= np.isfinite(raster.lowest) | held | np.isfinite(opened).any(axis=-1)
+    known = [held, np.isfinite(raster.lowest), *np.isfinite(kept[:1])]
+    filled &= np.any([*known, np.isfinite(stacks["opened"]).any(axis=-1)], axis=0)
     j, i = np.nonzero(filled)
-    cells = np.empty(len(j), _record(len(radii)))
+    cells = np.empty(len(j), _record(len(radii), len(kept)))
     for name in ("lowest", "floor", "ground", "place"):
         cells[name] = getattr(raster, name)[filled]
-    for name, values in (("held", held), ("means", places), ("opened", opened)):
+    for name, values in (("held", held), ("means", places), *stacks.items()):
         cells[name] = values[filled]
     cells["column"], cells["row"] = i + raster.window.left, j + raster.window.bottom
     return cells

@@ -27,7 +27,7 @@ classification of airborne LIDAR data. ISPRS Journal of Photogrammetry and Remot
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -36,34 +36,34 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.dimensions import opening
 from ..base.grid import GridWindow
-from ..base.threads import map_blocks
-from .cells import HIGHEST, HOLE, columns, usable
+from .cells import HIGHEST, columns, usable
+from .filter_options import FilterOptions, Keep
 from .ground_blocks import GroundCells
-from .openings import FILL_RINGS, fill_holes, openings_of
+from .minimum_grid import GroundPoints
+from .openings import FILL_RINGS
 from .pieces import patches
 from .smrf import (
-    FAR,
-    RIM,
-    CellMeans,
-    FilterOptions,
-    GroundPoints,
-    ground_means,
-    ground_raster,
-    minimum_grid,
+    cell_steps,
+    given_steps,
+    ground_filter,
+    heights_of,
+    holes,
+    reach_of_cells,
+    reach_of_given,
+    reach_of_points,
+    surface_steps,
 )
-from .surface import GroundRaster, cells_around, heights_above, surface
-
-#: Points handed to a thread at a time.
-_SPAN = 1 << 17
+from .steps import Chain
+from .surface import GroundRaster
 
 
 class _Piece(NamedTuple):
-    """A piece of a cloud and its ground."""
+    """A piece of a cloud, its ground, and the steps that are left to do."""
 
     rows: Any  #: indices of its points, and of those around that matter; or a slice
     core: Any  #: which of these belong to the piece, or a slice
     raster: GroundRaster
-    means: CellMeans | None = None  #: means of the ground points, where they are known
+    steps: Chain
 
 
 def filtered_ground(
@@ -98,12 +98,7 @@ def filtered_ground(
         Receives counts: ``ground_points``, ``without_terrain`` (points with no ground near; their
         height is 0), ``unused_points``.
     **options
-        `cell` (1): side of the grid's cells; `slope` (0.1): a window of radius r removes what it
-        lowers by more than `slope` times r; `window` (18): radius of the largest window, half the
-        width of the largest object that is removed; `threshold` (0.4) and `scalar` (1.25): a point
-        is ground within `threshold` + `scalar` times the terrain's slope of the surface;
-        `openings` (): windows of openings of the minimum grid above which heights are wanted too;
-        `slope_too` (False): whether the terrain's slope is wanted. Lengths in meters.
+        Fields of :class:`.filter_options.FilterOptions`, lengths in meters.
 
     Returns
     -------
@@ -124,7 +119,11 @@ def filtered_ground(
     known = None if ground is None else (usable(x, y, z, mask=ground) & use)[rows]
     points = GroundPoints.in_cells(x[rows], y[rows], z[rows], use[rows], settings.cell)
     counts = {} if figures is None else figures
-    out = _heights(points, settings, known, cells, threads, counts)
+    pieces = _pieces(points, settings, known, cells, threads)
+    out = _heights(points, settings, pieces, threads, counts)
+    if known is not None:
+        out["Ground"][known] = 1
+    counts["ground_points"] = int(np.count_nonzero(out["Ground"]))
     counts["unused_points"] = int(len(x) - np.count_nonzero(use))
     return out if finite.all() else {k: _spread(v, rows, len(x)) for k, v in out.items()}
 
@@ -136,121 +135,134 @@ def _spread(values: NDArray, rows: Any, count: int) -> NDArray:
     return whole
 
 
-def _heights(
+def _pieces(
     points: GroundPoints,
     options: FilterOptions,
     ground: NDArray[np.bool_] | None,
     cells: GroundCells | None,
     threads: int | None,
+) -> Iterator[_Piece]:
+    """Return the pieces of a cloud, with ground that is given, known or found."""
+    if ground is not None:
+        return _given_pieces(points, options, ground, threads)
+    if cells is not None:
+        return _known_pieces(points, options, cells, threads)
+    return _filtered_pieces(points, options, threads)
+
+
+def _heights(
+    points: GroundPoints,
+    options: FilterOptions,
+    pieces: Iterable[_Piece],
+    threads: int | None,
     counts: dict[str, int],
 ) -> dict[str, NDArray]:
-    """Compute the heights of points above ground that is given, known or filtered; add `counts`."""
+    """Compute the heights of the points of pieces; add to `counts`."""
     count = len(points.x)
+    counts["without_terrain"] = 0
     out: dict[str, NDArray] = {
         "HeightAboveGround": np.zeros(count),
         "Ground": np.zeros(count, np.uint8),
         **({"Slope": np.zeros(count)} if options.slope_too else {}),
         **{opening(width).name: np.zeros(count, np.float32) for width in options.openings},
     }
-    counts["without_terrain"] = 0
-    if ground is not None:
-        pieces = _given_pieces(points, options, ground)
-    elif cells is not None:
-        pieces = _known_pieces(points, options, cells)
-    else:
-        pieces = _filtered_pieces(points, options)
     for piece in pieces if count else ():
-        dimensions = _measure(points.take(piece.rows), piece, options, threads, counts)
+        part = points.take(piece.rows)
+        own = _cut_to(_window_of(part, piece.core), options.keep)
+        raster = piece.steps.run(part, piece.raster, keep=own)
+        dimensions, nowhere = _measure(part, raster, options, threads)
+        counts["without_terrain"] += int(np.count_nonzero(nowhere[piece.core]))
         rows = piece.rows if isinstance(piece.rows, slice) else piece.rows[piece.core]
         for name, values in dimensions.items():
             out[name][rows] = values[piece.core]
-    if ground is not None:
-        out["Ground"][ground] = 1
-    counts["ground_points"] = int(np.count_nonzero(out["Ground"]))
     return out
 
 
-def _filtered_pieces(points: GroundPoints, options: FilterOptions) -> Iterator[_Piece]:
+def _cut_to(core: GridWindow, keep: Keep | None) -> Keep | None:
+    """Return a function that keeps the cells of a piece's own points of rasters."""
+
+    def cut(name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
+        assert keep is not None
+        keep(name, core, values[core.slices_in(window)])
+
+    return None if keep is None else cut
+
+
+def _window_of(points: GroundPoints, rows: Any = slice(None)) -> GridWindow:
+    """Return the window of the cells of some points."""
+    return GridWindow.enclosing(points.column[rows], points.row[rows])
+
+
+def _filtered_pieces(
+    points: GroundPoints, options: FilterOptions, threads: int | None
+) -> Iterator[_Piece]:
     """Yield pieces of the cloud with the ground that the filter finds."""
-    for rows, core in patches(points.column, points.row, options.reach_of_points, options.link):
-        part, near = points.take(rows), None
+    cells, gap = cell_steps(options), ground_filter(options).gap
+    measure = surface_steps(options, cells.last, threads)
+    for rows, core in patches(points.column, points.row, reach_of_points(options), gap):
+        part, wanted = points.take(rows), None
+        own = _window_of(part, core)
+        window = _window_of(part).padded(FILL_RINGS + 1)
         # Points farther away only tell which cells are ground.
         if not isinstance(rows, slice) and not isinstance(core, slice):
-            near = GridWindow.enclosing(part.column[core], part.row[core])
-            near = near.padded(options.reach_of_points - options.reach)
-            seen = near.contains(part.column, part.row)
+            wanted = own.padded(reach_of_cells(options, cells.last))
+            seen = wanted.contains(part.column, part.row)
             rows, core = rows[seen], core[seen]
-        yield _Piece(rows, core, ground_raster(part, options, wanted=near))
+        raster = cells.run(part, holes(window), wanted, _cut_to(own, options.keep))
+        yield _Piece(rows, core, raster, measure)
 
 
 def _known_pieces(
-    points: GroundPoints, options: FilterOptions, cells: GroundCells
+    points: GroundPoints,
+    options: FilterOptions,
+    cells: GroundCells,
+    threads: int | None,
 ) -> Iterator[_Piece]:
     """Yield pieces of the cloud with the ground raster that an earlier round computed."""
-    for rows, core in patches(points.column, points.row, 0, options.link):
-        window = GridWindow.enclosing(points.column[rows], points.row[rows])
-        window = window.padded(options.reach_of_cells)
-        yield _Piece(rows, core, *cells.raster(window, options.requested_radii))
+    steps = cell_steps(options)
+    for rows, core in patches(points.column, points.row, 0, ground_filter(options).gap):
+        window = _window_of(points, rows)
+        kept = 0 if options.keep is None else len(steps.steps)
+        known = cells.raster(window.padded(reach_of_cells(options)), options, kept)
+        for step, values in zip(steps.steps, known.kept, strict=False):
+            if options.keep is not None:
+                options.keep(step.name, window, values[window.slices_in(known.raster.window)])
+        steps_left = surface_steps(options, steps.last, threads, known.means)
+        yield _Piece(rows, core, known.raster, steps_left)
 
 
 def _given_pieces(
-    points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_]
+    points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_], threads: int | None
 ) -> Iterator[_Piece]:
-    """Yield pieces of the cloud with the raster of the points (n,) that are given as `ground`."""
-    margin = RIM + FILL_RINGS + max([0, *options.requested_radii])
-    for rows, core in patches(points.column, points.row, options.reach_of_given, options.link):
-        part = points.take(rows)
-        window = GridWindow.enclosing(part.column, part.row).padded(margin)
-        held, place = means = ground_means([(part, ground[rows])], options.cell, window)
-        heights = np.where(held, place[..., 2], HOLE).astype(np.float32)
-        opened = {}
-        if options.openings:  # of all points, without low outliers
-            _, lowest = minimum_grid(part, window, options.cell)
-            opened = dict(openings_of(fill_holes(lowest), {*options.requested_radii}))
-        yield _Piece(rows, core, GroundRaster(window, heights, place, held, heights, opened), means)
+    """Yield pieces of the cloud whose `ground` points (n,) are given."""
+    gap = given_steps(options, ground).gap
+    margin = FILL_RINGS + 2 + max([0, *options.requested_radii])
+    for rows, core in patches(points.column, points.row, reach_of_given(options), gap):
+        window = _window_of(points, rows).padded(margin)
+        yield _Piece(rows, core, holes(window), given_steps(options, ground[rows], threads))
 
 
 def _measure(
-    points: GroundPoints,
-    piece: _Piece,
-    options: FilterOptions,
-    threads: int | None,
-    counts: dict[str, int],
-) -> dict[str, NDArray]:
-    """Compute the dimensions of the points of a piece; 0 where no ground is near.
+    points: GroundPoints, raster: GroundRaster, options: FilterOptions, threads: int | None
+) -> tuple[dict[str, NDArray], NDArray[np.bool_]]:
+    """Return the dimensions of points above the surface of a raster, and which have none near.
 
-    Points are ground or not by the provisional surface; heights are measured from the surface
-    through the means of these points.
+    The height of these (n,) is 0.
     """
-    x, y, z, _, column, row = points
-    raster, cell, corner = piece.raster, options.cell, piece.raster.window[:2]
-    needed = cells_around(raster.window, column, row)
-    planes = surface(raster, options.near_levels, needed)
-    spans = [slice(start, start + _SPAN) for start in range(0, len(x), _SPAN)]
-
-    def above(planes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        height, gradient = np.empty((2, len(x)))
-
-        def measure(s: slice) -> None:
-            heights_above(x[s], y[s], z[s], cell, corner, planes, height[s], gradient[s])
-
-        list(map_blocks(measure, spans, threads))
-        return height, gradient
-
-    is_ground = options.is_ground(points.use, *above(planes))
-    held, place = piece.means or ground_means([(points, is_ground)], cell, raster.window)
-    raster = replace(raster, ground=held, place=place)
-    height, gradient = above(surface(raster, options.levels(FAR), needed, planes))
+    assert raster.is_ground is not None and raster.planes is not None
+    height, gradient = heights_of(points, raster, options.cell, threads)
     nowhere = np.isnan(height)
-    counts["without_terrain"] += int(np.count_nonzero(nowhere[piece.core]))
     height[nowhere] = gradient[nowhere] = 0.0
-    out: dict[str, NDArray] = {"HeightAboveGround": height, "Ground": is_ground.view(np.uint8)}
+    out: dict[str, NDArray] = {
+        "HeightAboveGround": height,
+        "Ground": raster.is_ground.view(np.uint8),
+    }
     if options.slope_too:
         out["Slope"] = np.degrees(np.arctan(gradient))
-    planes[:] = 0.0
+    planes = np.zeros_like(raster.planes)
     for width, radius in zip(options.openings, options.requested_radii, strict=True):
         opened = raster.opened[radius]
         planes[..., 0] = np.where(np.isfinite(opened), opened, np.nan)
-        values, _ = above(planes)
+        values, _ = heights_of(points, replace(raster, planes=planes), options.cell, threads)
         out[opening(width).name] = np.where(np.isnan(values), height, values).astype(np.float32)
-    return out
+    return out, nowhere

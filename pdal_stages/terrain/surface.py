@@ -11,7 +11,7 @@ fixed tree, so the same ground gives the same bits whatever lies further away.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,11 @@ class GroundRaster:
     ground: NDArray[np.bool_]  #: (h, w)
     floor: NDArray[np.float32]  #: (h, w) what lies below objects
     opened: Mapping[int, NDArray[np.float32]]  #: (h, w) openings by their radius
+    #: (h, w, 3) of a surface: see :func:`surface`
+    planes: NDArray[np.float64] | None = None
+    is_ground: NDArray[np.bool_] | None = (
+        None  #: (n,) which points are ground, once they are judged
+    )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -49,13 +54,20 @@ class GroundRaster:
         return self.ground.shape
 
     def cut(self, window: GridWindow) -> GroundRaster:
-        """Return a copy of the cells of a window."""
+        """Return the cells of a window: a copy, or all of it."""
+        if window == self.window:
+            return self
         part = window.slices_in(self.window)
-        rasters = {
-            field.name: getattr(self, field.name)[part].copy() for field in fields(self)[1:-1]
+        rasters = {name: getattr(self, name) for name in _RASTERS}
+        cells = {
+            name: values[part].copy() for name, values in rasters.items() if values is not None
         }
         opened = {radius: values[part].copy() for radius, values in self.opened.items()}
-        return replace(self, window=window, opened=opened, **rasters)
+        return replace(self, window=window, opened=opened, **cells)
+
+
+#: Fields of a :class:`GroundRaster` that have a value for each cell.
+_RASTERS = ("lowest", "place", "ground", "floor", "planes")
 
 
 def reach(levels: int) -> int:
@@ -293,7 +305,7 @@ def surface(
     ground, place = raster.ground, raster.place
     blocks, corner = planes_of_blocks(raster, levels, needed)
     if planes is None:
-        planes = np.zeros((*ground.shape, 3))
+        planes = np.full((*ground.shape, 3), np.nan)
     _finer(blocks, *corner, 1.0, *raster.window[:2], needed, planes)
     # Those of ground cells hold their cell's ground.
     j, i = np.nonzero(ground & needed)
@@ -317,8 +329,11 @@ def heights_above(x, y, z, cell, corner, planes, height, gradient):
         gradient[p] = np.sqrt(across * across + along * along) / cell
 
 
-def cells_around(window: GridWindow, column: NDArray, row: NDArray) -> NDArray[np.bool_]:
-    """Mark the cells (h, w) of points and all around them, whose planes points blend."""
-    held = np.zeros((window.height, window.width), bool)
-    held.ravel()[window.flat_index(column, row)] = True
+def cells_around(
+    window: GridWindow, wanted: GridWindow, column: NDArray, row: NDArray
+) -> NDArray[np.bool_]:
+    """Mark the cells (h, w) of a window that points of wanted cells blend: theirs and around."""
+    held = np.zeros(window.shape, bool)
+    inside = wanted.contains(column, row)
+    held.ravel()[window.flat_index(column[inside], row[inside])] = True
     return highest_around(held, 1, 0)

@@ -46,6 +46,11 @@ class WideRoofRules:
         far = 2 * self.radius_m + self.max_extent_m + 2 * window + 2 * self.gap_m
         return (self.cells(far, cell) + FILL_RINGS + 6) * self.cells_per_side(cell)
 
+    def gap(self, cell: float) -> int:
+        """Return across how many cells of the filter without points windows see others."""
+        coarse = self.cells(self.radius_m, cell) + 2 * FILL_RINGS + 1
+        return coarse * self.cells_per_side(cell)
+
 
 RULES = WideRoofRules()
 
