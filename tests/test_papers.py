@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import glob
+import importlib
 import json
+import re
+import shlex
 import sys
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
@@ -185,3 +190,83 @@ def test_h17_thresholds_are_a_choice_between_two_tables(town):
     assert 0.05 < (part.curvature >= 0.05).mean() < 0.95
     shares = h17_oakland.shares(part.labels, part.curvature, 0.0)
     assert all(share["points"] == share["scattered"] for share in shares.values())
+
+
+# ---- the page's commands -----------------------------------------------------------------------------------
+
+ROOT = FOLDER.parent.parent
+#: What makes a command quick; maps.py draws the pictures of forests, as PyTorch is not everywhere.
+QUICK = {
+    "b16_experiments.py": "--seeds 1",
+    "w18.py": "--seeds 1 --count 30 --trees 3",
+    "maps.py": "--only blomley2016 weinmann2018 weinmann2018-binary he2017",
+    "pdal-stages train": "--writers.classifiermodel.count=60 --writers.classifiermodel.trees=3 --neighborhoods k10",
+    "vaihingen-train.json": "--stage.model.neighborhoods=c2 --stage.model.count=60 --stage.model.trees=3",
+}
+#: Numbers of samples and trees that are no options, and their quick values.
+SMALL = {
+    "h17_oakland": {"COUNT": 20, "TREES": 3, "CURVE": (0.03,), "HEIGHTS": ("range",), "OTHERS": ()},
+    "b16_experiments": {"COUNT": 20, "TREES": (3,)},
+}
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """A folder with clouds under the names of the papers' data, and the repository's commands."""
+    from pdal_stages.synthetic import make_town, write_town
+
+    monkeypatch.chdir(tmp_path)
+    write_town(make_town(size=40, density=3, seed=5, progress=False), tmp_path / "town.laz")
+    las = laspy.read("town.laz")
+    las = las[np.isin(las.classification, (2, 3, 5, 6))]
+    other = {"delft": {3: 1, 5: 1}, "montpellier": {}, "oakland": {3: 14}}
+    parts = {"delft": ("train.laz", "test.laz"), "montpellier": ("train_a.laz", "test_a.laz")}
+    parts["oakland"] = ("train/a.laz", "test/oakland_part2_ac.laz", "val/a.laz")
+    west = np.asarray(las.x) < np.median(las.x)
+    for scene, names in parts.items():
+        for number, name in enumerate(names):
+            part = las[west if number % 2 == 0 else ~west]
+            for code, label in other[scene].items():
+                part.classification[part.classification == code] = label
+            labels = np.asarray(part.classification).copy()
+            labels[::7] = {"oakland": 15, "montpellier": 4}.get(scene, 1)
+            part.classification = labels
+            (tmp_path / "DIR" / scene / name).parent.mkdir(parents=True, exist_ok=True)
+            part.write(tmp_path / "DIR" / scene / name)
+    cloud = clouds.read_cloud(["town.laz"], "town")
+    nine = clouds.Cloud("town", cloud.xyz, np.arange(len(cloud)) % 9, {})
+    for name in ("Vaihingen3D_Traininig.pts", "Vaihingen3D_EVAL_WITH_REF.pts"):
+        pts_input.write_pts(tmp_path / name, nine)
+    (tmp_path / "benchmarks").symlink_to(ROOT / "benchmarks")
+    (tmp_path / "docs" / "pictures").mkdir(parents=True)
+    return tmp_path
+
+
+@pytest.mark.pdal
+@pytest.mark.slow
+def test_commands_of_the_page_run_as_printed(stand_in, monkeypatch, capsys):
+    from pdal_stages.cli import main
+
+    for module, values in SMALL.items():
+        for name, value in values.items():
+            monkeypatch.setattr(importlib.import_module(module), name, value)
+    for recipe, (scene, more) in maps.MAPS.items():
+        quick = {"trees_grid": (3,)} if recipe == "blomley2016" else {"trees": 3}
+        monkeypatch.setitem(maps.MAPS, recipe, (scene, {**more, **quick, "count": 30}))
+    page = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")
+    text = "\n".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE))
+    lines = [*filter(None, text.replace("\\\n", " ").splitlines())]
+    assert len(lines) == 9, lines
+    for line in lines:
+        words = [name for word in shlex.split(line) for name in (sorted(glob.glob(word)) or [word])]
+        words += [word for key, more in QUICK.items() if key in line for word in shlex.split(more)]
+        if words[0] == "python":
+            monkeypatch.setattr(sys, "argv", words[1:])
+            importlib.import_module(Path(words[1]).stem).main()
+        else:
+            assert main(words[1:]) == 0, (words, capsys.readouterr().err)
+    assert {path.name for path in (stand_in / "docs" / "pictures").iterdir()} == {
+        f"paper-{name}.png" for name in QUICK["maps.py"].split()[1:]
+    }
+    report = json.loads((stand_in / "vaihingen-accuracy.json").read_text())
+    assert len(report["classes"]) == 9

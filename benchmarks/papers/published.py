@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from tables import table
 
+from pdal_stages.classifier.training_options import RECIPES
+
 # ---- [H17] Table 2, and the classes of the test clouds -----------------------------------------------------
 
 H17_CLASSES = ("vegetation", "wire", "pole/trunk", "ground", "facade")
@@ -172,8 +174,10 @@ VAIHINGEN = (
     "shrub",
     "tree",
 )
-#: What the labels become in vaihingen-train.json and vaihingen-evaluate.json.
-VAIHINGEN_CODES = (14, 3, 11, 64, 65, 6, 67, 4, 5)
+#: What the labels become by the recipe.
+VAIHINGEN_CODES = tuple(
+    int(value.partition(" ")[0]) for value in RECIPES["vaihingen"]["classes"].values()
+)
 W18 = [
     [432, 1, 0, 0, 0, 44, 20, 2, 101],
     [0, 56068, 15233, 125, 1692, 8859, 595, 14128, 1990],
@@ -422,7 +426,7 @@ def page() -> str:
         " must add up to all N = 1,324,310. With the two words of the table as printed they do "
         "not; exchanged, they do to"
         " four digits, for all three neighborhoods, and the overall accuracy of v_c comes out as "
-        "the text states it (96.1).",
+        "the text states it (96.1). OA is derived from the table; for v_k and v_r the paper gives none.",
         h17(),
     ]
     for number, measure in enumerate(B16, 2):
@@ -458,7 +462,8 @@ def page() -> str:
         "## [W18] and [WM19] on ISPRS Vaihingen",
         overall(),
         "[W18] says of ten times the samples: +3.4 OA, +3.8 kappa, +5.7 mean F1.",
-        "[WM19] gives 80.6 in its abstract and 80.2 in its text; its matrix says 80.6.",
+        "[WM19] gives 80.6 in its abstract and 80.2 in its text; its matrix says 80.6. Its kappa "
+        "and mean F1 are derived from the matrix; it gives neither.",
         vaihingen(),
         "[W18], Tab. 1",
         confusion(W18),
