@@ -157,6 +157,20 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
             )
 
 
+def test_of_what_is_assumed_there_is_one_message(tmp_path, write_las):
+    """Also where a tile has points of the input without a reference alone."""
+    for number, wkt in enumerate((METERS, None)):
+        xyz = np.random.default_rng(0).uniform(0, 30, (500, 3)) + (5e5 + 400 * number, 5e6, 0)
+        arrays = dict(zip("XYZ", xyz.T, strict=True))
+        write_las(tmp_path / f"in{number}.las", arrays, point_format=6, wkt=wkt)
+    heights = {"type": "filters.hag_morphological"}
+    stages = [str(tmp_path / "in*.las"), heights, str(tmp_path / "o_#.las")]
+    messages = run_tiled(stages, 100, workers=0).messages
+    assert [("assumed to have" in m, "were assumed" in m) for m in messages if "assumed" in m] == [
+        (True, False)
+    ]
+
+
 def test_an_output_without_a_reference_is_said(tmp_path, inputs):
     """The log says what was assumed, and that this is not written; `default_srs` writes it."""
     stages = [
