@@ -160,7 +160,8 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
 def test_of_what_is_assumed_there_is_one_message(tmp_path, write_las):
     """Also where a tile has points of the input without a reference alone."""
     for number, wkt in enumerate((METERS, None)):
-        xyz = np.random.default_rng(0).uniform(0, 30, (500, 3)) + (5e5 + 400 * number, 5e6, 0)
+        corner = np.array([5e5 + 400 * number, 5e6, 0])
+        xyz = np.random.default_rng(0).uniform(0, 30, (500, 3)) + corner
         arrays = dict(zip("XYZ", xyz.T, strict=True))
         write_las(tmp_path / f"in{number}.las", arrays, point_format=6, wkt=wkt)
     heights = {"type": "filters.hag_morphological"}

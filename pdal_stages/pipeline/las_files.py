@@ -261,7 +261,11 @@ def compress(partials: Iterable[Path]) -> dict[str, str]:
 
 #: Points read at a time: 30 to 70 MB as LAS stores them.
 PART = 1_000_000
-_LASPY = {"ReturnNumber": "return_number", "NumberOfReturns": "number_of_returns"}
+_LASPY = {
+    "ReturnNumber": "return_number",
+    "NumberOfReturns": "number_of_returns",
+    "GpsTime": "gps_time",
+}
 
 
 def can_read_chunks(path: str) -> bool:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..base import checks
 from ..base.asprs import NOISE
+from ..base.distinct import DistinctPoints
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs, write_json
 from ..base.las import read_header
@@ -24,10 +25,10 @@ from ..base.vector import vector
 from ..base.version import __version__
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD, find
+from ..pipeline.distinct_files import DistinctFiles
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.las_files import can_read_chunks, read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
-from ..pipeline.workers import each_file
 from ..reports.vector_files import Layer, check_target, qml, write_layers
 from ..stages.points import Points
 from .expected_errors import Patches, ReviewCells, cell_side, find_patches
@@ -149,7 +150,10 @@ def review_files(
     points, area = _points_and_area(files, references)
     side = cell or cell_side(points, area)
     work = [(path, references[path].wkt, model, side, number) for number, path in enumerate(files)]
-    parts = [part for cells in each_file(cells_of_file, work, workers) for part in cells]
+    distinct = DistinctFiles(files)
+    results = distinct.results(cells_of_file, work, workers)
+    parts = [part for cells in results for part in cells]
+    print_messages(*distinct.messages)
     if not points:
         nothing = np.empty(0, np.uint8)
         parts = [ReviewCells.from_points(np.empty((0, 3)), nothing, nothing, side)]
@@ -168,11 +172,18 @@ def review_files(
     return Review(cells, patches, listed, files, references[files[0]].units.horizontal)
 
 
-def cells_of_file(path: str, wkt: str, model: str, side: float, number: int) -> list[ReviewCells]:
+def cells_of_file(
+    path: str,
+    wkt: str,
+    model: str,
+    side: float,
+    number: int,
+    distinct: DistinctPoints | None = None,
+) -> list[ReviewCells]:
     """Return the cells of a file; reliabilities that it lacks are computed, with a message."""
     cells: list[ReviewCells] = []
     unrated: list[dict[str, NDArray]] = []
-    for part in read_points(path, wkt):
+    for part in read_points(path, wkt, distinct):
         if "Reliability" not in part:
             unrated.append(part)
         elif len(part["codes"]):
@@ -189,13 +200,18 @@ def cells_of_file(path: str, wkt: str, model: str, side: float, number: int) -> 
     return [ReviewCells.join(cells)] if cells else []
 
 
-def read_points(path: str, wkt: str) -> Iterator[dict[str, NDArray]]:
-    """Yield the points of a file that are neither noise nor withheld, in its order.
+def read_points(
+    path: str, wkt: str, distinct: DistinctPoints | None = None
+) -> Iterator[dict[str, NDArray]]:
+    """Yield the points of a file that are neither noise nor withheld, in its order, once each.
 
     Each part has ``xyz`` (n, 3) in meters, ``codes`` (n,), and those of :data:`DIMENSIONS` that
     exist.
     """
-    for arrays, flags in read_columns(path, DIMENSIONS):
+    distinct = distinct or DistinctPoints()
+    for columns, flags in read_columns(path, (*DIMENSIONS, "GpsTime")):
+        first = distinct.first(columns)
+        arrays = {name: values[first] for name, values in columns.items()}
         points = Points(arrays, wkt=wkt, legacy_flags=flags)
         codes = points.class_codes
         kept = ~np.isin(codes, NOISE) & ~points.flag("Withheld").astype(bool)

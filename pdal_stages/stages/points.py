@@ -222,7 +222,7 @@ class Points:
 
     @cached_property
     def reliability(self) -> NDArray[np.float32] | None:
-        """Return `Reliability` (n,), 0 where it is NaN; None where the points have none.
+        """Return `Reliability` (n,), NaN where it is not known; None where there is none.
 
         Raises
         ------
@@ -232,19 +232,18 @@ class Points:
         if "Reliability" not in self.arrays:
             return None
         values = np.asarray(self.arrays["Reliability"])
-        known = np.where(np.isnan(values), 0, values)
         # Averages of shares may leave 0 to 1 by rounding.
-        beyond = (known < -_SHARE_ROUNDING) | (known > 1 + _SHARE_ROUNDING)
+        beyond = (values < -_SHARE_ROUNDING) | (values > 1 + _SHARE_ROUNDING)
         if beyond.any():
             count = f"{np.count_nonzero(beyond):,} of {self.count:,} points"
             raise DimensionError(
                 "'Reliability' must be the probability of a point's class, 0 to 1",
-                found=f"{known.min():g} to {known.max():g}; {count} lie beyond",
+                found=f"{np.nanmin(values):g} to {np.nanmax(values):g}; {count} lie beyond",
                 cure="Scale it, or leave it out: pdal-stages review computes one where there is "
                 "none. Of per cent: pdal translate IN OUT assign "
                 "--filters.assign.value='Reliability = Reliability / 100'",
             )
-        return np.clip(known, 0, 1).astype(np.float32, copy=False)
+        return np.clip(values, 0, 1).astype(np.float32, copy=False)
 
     def flag(self, name: str) -> NDArray:
         """Return a flag of each point (n,), 0 or 1; before PDAL 2.6 it is a bit of a dimension."""

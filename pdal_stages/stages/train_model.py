@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.distinct import DistinctPoints
 from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
 from ..base.messages import Report
@@ -199,8 +200,13 @@ class TrainModel(Stage, settings=TrainingOptions):
         names = [Path(name).name for name in self.files]
         return ", ".join([*names[:_NAMED], *["..."] * (len(names) > _NAMED)]) or "the points"
 
-    def cloud_of(self, points: Points, training: TrainingOptions) -> TrainingCloud:
-        """Return the points as a cloud to train on."""
+    def cloud_of(
+        self, points: Points, training: TrainingOptions, distinct: DistinctPoints | None = None
+    ) -> TrainingCloud:
+        """Return the points as a cloud to train on, without those that came before.
+
+        `distinct` knows the points of clouds before this one.
+        """
         needed = required_dimensions(training.inputs)
         dimensions = {name: points.dimension(name) for name in needed}
         dimensions |= {
@@ -215,6 +221,13 @@ class TrainModel(Stage, settings=TrainingOptions):
         )
         # Class codes are left to the trainer: they may be labels.
         gone = points.ignored(replace(self.ignore, codes=()))
+        again = ~(distinct or DistinctPoints()).first(points.arrays)
+        if repeated := np.count_nonzero(again):
+            points.report.notes.append(
+                f"{repeated:,} of {points.count:,} points come twice, at the same place and time, "
+                "and are counted once"
+            )
+            gone |= again
         return cloud.part(np.flatnonzero(~gone)) if gone.any() else cloud
 
     def finish(self, model: Model, report: Report) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.distinct import DistinctPoints
 from ..base.errors import OptionError
 from ..base.files import JSON, Output, check_outputs, write_json
 from ..base.messages import one_line, print_messages
@@ -20,19 +21,19 @@ from ..base.version import __version__
 from ..objects.cells import Cells, refuse_unclassified
 from ..objects.detect import find_objects
 from ..objects.results import Objects
+from ..pipeline.distinct_files import DistinctFiles
 from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.json_source import Override
 from ..pipeline.las_files import read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
-from ..pipeline.workers import each_file
 from ..reports.object_layers import write_objects
 from ..stages.write_objects import STRAIGHT, WriteObjects
 
 #: Stages whose options the commands accept for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
 #: Dimensions that are read of LAZ 1.4 (see :func:`.las_files.read_chunks`).
-_ONLY = ("Z", "CLASSIFICATION", "FLAGS", "ALL_EXTRA_BYTES")
+_ONLY = ("Z", "CLASSIFICATION", "FLAGS", "GPS_TIME", "ALL_EXTRA_BYTES")
 #: Meters; cells are not enlarged beyond this automatically: neighboring houses would merge.
 LARGEST_CELL = 4.0
 
@@ -102,18 +103,25 @@ def _all_cells(inputs: Sequence[str], stage: WriteObjects, wkt: str, workers: in
     """Return the cells of all files."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
-    for part, codes in each_file(_cells_of, [(path, stage, wkt) for path in inputs], workers):
+    files = DistinctFiles(inputs)
+    work = [(path, stage, wkt) for path in inputs]
+    for part, codes in files.results(_cells_of, work, workers):
         cells = Cells.join([cells, part])
         seen += codes
+    print_messages(*files.messages)
     refuse_unclassified(cells, np.flatnonzero(seen).astype(np.uint8))
     return cells
 
 
-def _cells_of(path: str, stage: WriteObjects, wkt: str) -> tuple[Cells, NDArray[np.int64]]:
+def _cells_of(
+    path: str, stage: WriteObjects, wkt: str, distinct: DistinctPoints
+) -> tuple[Cells, NDArray[np.int64]]:
     """Return the cells of a file, and its numbers of points (256,) by class code."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
-    for arrays, flags in read_columns(path, ("Reliability",), _ONLY):
+    for columns, flags in read_columns(path, ("Reliability", "GpsTime"), _ONLY):
+        first = distinct.first(columns)
+        arrays = {name: values[first] for name, values in columns.items()}
         points = stage.points(arrays, wkt=wkt, legacy_flags=flags)
         seen += np.bincount(points.class_codes, minlength=256)
         cells = Cells.join([cells, stage.records(points)])

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..base import las
+from ..base.distinct import DistinctPoints
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs
 from ..base.memory import free_memory
@@ -151,6 +152,7 @@ class TrainTask:
     def _train(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
         """Train on all points of a survey at once, one survey after the other."""
         training: Any = None
+        distinct = DistinctPoints()
 
         def clouds() -> Iterator[TrainingCloud]:
             nonlocal training
@@ -159,7 +161,7 @@ class TrainTask:
                 options = self.stage.training_on(points)
                 training = training or options
                 _check_same(options.dimensions, training.dimensions)
-                cloud = self.stage.cloud_of(points, options)
+                cloud = self.stage.cloud_of(points, options, distinct)
                 report.merge(points.report)
                 yield replace(cloud, name=name, survey=name) if name else cloud
 
