@@ -42,6 +42,12 @@ def test_density_is_robust_and_knows_no_order():
     strays = np.vstack([xyz, [[1e9, -1e9, 0.0]] * 5, random.normal(20, 0.01, (900, 3))])
     assert density(strays) == pytest.approx(10.0, rel=0.05)
     assert density(strays[random.permutation(len(strays))]) == density(strays)
+    for thin in (0.2, 0.048, 0.03, 0.001):  # cells of 2 m hold a point each where they hold any
+        xyz = np.column_stack(
+            [random.uniform(0, 500, (2, round(thin * 500**2))).T, np.zeros(round(thin * 500**2))]
+        )
+        assert density(xyz) == pytest.approx(0.25 if thin == 0.2 else thin, rel=0.25)
+        assert density(xyz - 250.0) == pytest.approx(0.25 if thin == 0.2 else thin, rel=0.25)
     assert density(np.zeros((0, 3))) == 0.0 and density(np.zeros((7, 3))) == 7 / 4
 
 
@@ -155,3 +161,17 @@ def test_clouds_made_one_at_a_time(tmp_path):
     at_hand = learned(clouds(3), passes=2, context=["own", "box1"], thin=[0.3])
     streamed = learned(iter(clouds(3)), passes=2, context=["own", "box1"], thin=[0.3])
     assert written(at_hand, tmp_path, "a") == written(streamed, tmp_path, "b")
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize(("thin", "said"), [(0.3, False), (0.048, True), (0.03, True)])
+def test_a_cloud_thinner_than_any_that_was_learned_from_is_said(
+    tmp_path, run, write_las, thin, said
+):
+    count = round(thin * 300**2)
+    x, y = np.random.default_rng(0).uniform(0, 300, (2, count))
+    arrays = {"X": x, "Y": y, "Z": 0.01 * x, "ReturnNumber": np.ones(count, np.uint8)}
+    arrays["NumberOfReturns"] = arrays["ReturnNumber"]
+    source = write_las(tmp_path / "thin.laz", arrays, point_format=6)
+    code, _, err = run("classify", source, tmp_path / "o.laz", "--no-progress")
+    assert code == 0 and ("points/m2, the model was trained on" in err) == said, err

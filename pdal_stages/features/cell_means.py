@@ -19,6 +19,8 @@ WHOLE = 65535
 #: Side of the cells whose points are counted for the density, meters: large enough to hold points
 #: of sparse surveys (4 at 1/m²), small enough that most cells lie inside the cloud. Not tuned.
 CELL = 2.0
+#: Points in the median cell of a very thin cloud: enough that one more or less matters little.
+_SEVERAL = 8
 
 
 def cell_means(
@@ -50,15 +52,28 @@ def cell_means(
 def density(xyz: npt.NDArray[np.float64]) -> float:
     """Return points per square meter: the median over the occupied cells of :data:`CELL` meters.
 
-    0 for an empty cloud.
+    0 for an empty cloud. An occupied cell holds a point at least: where cells twice as wide hold a
+    single one, too, cells are widened until they hold `_SEVERAL`, or are as wide as the cloud.
     Strays, holes and the cloud's outline do not matter, and the order of the points does not.
     """
     if not len(xyz):
         return 0.0
-    keys, _ = compact_keys(xyz[:, :2], CELL)
+    cell, points = CELL, _points_per_cell(xyz, CELL)
+    if points > 1 or _points_per_cell(xyz, 2 * CELL) > 1:
+        return points / cell**2
+    width = np.ptp(xyz[:, :2], axis=0).max()
+    while points < _SEVERAL and cell < width:
+        cell *= 2.0
+        points = _points_per_cell(xyz, cell)
+    return points / cell**2
+
+
+def _points_per_cell(xyz: npt.NDArray[np.float64], cell: float) -> float:
+    """Return the median number of points in the occupied cells of a width in meters."""
+    keys, _ = compact_keys(xyz[:, :2], cell)
     keys.sort()
     starts = np.flatnonzero(begins_run(keys))
-    return float(np.median(np.diff(np.append(starts, len(keys))))) / CELL**2
+    return float(np.median(np.diff(np.append(starts, len(keys)))))
 
 
 # ---- kernels ---------------------------------------------------------------------------------
