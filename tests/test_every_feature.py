@@ -21,7 +21,8 @@ def engine():
     """A thick sheet, dense enough for shapes in every neighborhood."""
     rng = np.random.default_rng(8)
     xyz = np.column_stack([rng.uniform(0, 8, (400, 2)), rng.normal(0, 0.4, 400)])
-    groups = [*{f.group for f in FEATURES} - {"relative"}, "HeightAboveLowest"]
+    relative = [f.name for f in FEATURES if f.group == "relative"]  # no word of a feature set
+    groups = [*{f.group for f in FEATURES} - {"relative"}, *relative]
     return FeatureEngine(xyz, FeaturePlan.parse(TOKENS, groups), threads=1).fit()
 
 
