@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,3 +106,18 @@ def test_a_tile_with_its_halo_gives_the_same_bits(seed):
     core = (x >= 150) & (x < 250) & (y >= 150) & (y < 250)
     near = (x >= 70) & (x < 330) & (y >= 70) & (y < 330)
     assert np.array_equal(hag_minima(x[near], y[near], z[near])[core[near]], whole[core])
+
+
+def test_features_page_tells_of_cells_without_points():
+    """[W18 3.2] does not speak of them; a cloud without gaps needs some all around its edge."""
+    random = np.random.default_rng(0)
+    x, y, z = random.uniform(0, 100, (3, 5000))
+    figures = {}
+    hag_minima(x, y, z, figures=figures)
+    assert (figures["cells"], figures["interpolated_cells"]) == (
+        25,
+        24,
+    )  # 7 x 7 corners, 5 x 5 cells
+    page = (Path(__file__).parent.parent / "docs" / "features.md").read_text()
+    (told,) = [item for item in page.split("\n- ") if "filters.hag_minima" in item]
+    assert all(word in told for word in ("1.5 cells", "fourth power", "interpolated_cells"))
