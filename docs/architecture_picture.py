@@ -45,6 +45,7 @@ EXTRAS = (
     ("objects/", "outlines of buildings, trees", "filters.objects, objects"),
     ("review/", "what a person checks, corrects", "review, corrections"),
     ("reports/", "pages, pictures, vector files", "--html"),
+    ("surfaces/", "rasters, report of a survey", "surfaces, report"),
     ("synthetic/", "a generated town", "demo"),
     ("qgis/", "the plugin for QGIS", "calls the command"),
 )

@@ -23,6 +23,7 @@ _WHERE = {
     "Pipeline": "pipeline.run",
     "Place": "reports.accuracy_page",
     "StageError": "base.errors",
+    "SurfaceOptions": "surfaces",
     "TrainingCloud": "classifier.training_clouds",
     "TrainingOptions": "classifier.training_options",
     "Writer": "pipeline.python_pdal",
@@ -41,6 +42,8 @@ _WHERE = {
     "TilingOptions": "tiling.options",
     "train": "classifier.training",
     "write_accuracy_report": "reports.accuracy_page",
+    "write_report": "surfaces",
+    "write_surfaces": "surfaces",
 }
 
 __all__ = [*_WHERE, "__version__"]
@@ -62,6 +65,7 @@ if TYPE_CHECKING:
     from .pipeline.run import Pipeline, run_pipeline
     from .reports.accuracy_page import Place, write_accuracy_report
     from .reports.object_layers import object_layers
+    from .surfaces import SurfaceOptions, write_report, write_surfaces
     from .synthetic import make_town
     from .terrain import detached_noise, filtered_ground, hag_minima
     from .tiling.options import TilingOptions

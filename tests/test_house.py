@@ -11,13 +11,13 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent / "pdal_stages"
 FLOORS = (
     "base", "features terrain accuracy", "structures classifier", "alsnet objects", "reports", "stages", "pipeline",
-    "synthetic tiling plugin review", "cli",
+    "synthetic tiling plugin review", "surfaces", "cli",
 )  # fmt: skip
 #: Rooms that the core works without, and the modules of the core that may import them.
-EXTRAS = {"objects", "review", "reports", "synthetic"}
+EXTRAS = {"objects", "review", "reports", "surfaces", "synthetic"}
 DOORS = {
     "stages/accuracy.py", "stages/group_objects.py", "stages/write_objects.py",
-    "tiling/objects_from_files.py", "cli/extras.py", "cli/installation.py",
+    "tiling/objects_from_files.py", "cli/deliverables.py", "cli/extras.py", "cli/installation.py",
 }  # fmt: skip
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms.split()}
 

@@ -265,7 +265,7 @@ def session(clean_machine, profile):
 @needs_qgis
 def test_algorithms_are_listed(qgis):
     output = qgis("list")
-    names = "classify classifysurvey heights terrainmodels train accuracy review corrections objects check"
+    names = "classify classifysurvey heights terrainmodels surfaces report train accuracy review corrections objects check"
     for name in names.split():
         assert f"pdalstages:{name}\t" in output
 
@@ -331,6 +331,11 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     output = algorithm("accuracy", INPUT=cloud, REFERENCE=ready_town, PAGE=out / "a.html")
     assert "Overall accuracy" in output and (out / "a.html").read_text().startswith("<!")
     pytest.importorskip("pyogrio")
+    pytest.importorskip("rasterio")
+    output = algorithm("surfaces", INPUTS=cloud, OUTPUT=out / "rasters", RESOLUTION=2)
+    assert "% known" in output and len(list((out / "rasters").glob("*.tif"))) == 3
+    algorithm("report", INPUTS=cloud, PAGE=out / "report.html", DENSITY=2)
+    assert "Signature" in (out / "report.html").read_text()
     assert " buildings, " in algorithm("objects", INPUTS=cloud, OUTPUT=out / "o.gpkg")
     shown = session(
         "styles", out / "o.gpkg", out / "t.tif", heights.with_suffix(".tif"), out / "c.tif"

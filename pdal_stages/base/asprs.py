@@ -44,8 +44,11 @@ HIGH_VEGETATION = 5
 BUILDING = 6
 WIRE = 14  #: conductors
 BRIDGE = 17  #: bridge decks
+WATER = 9
 #: Classes of the terrain's surface, which ground that is given consists of: ground, water, road.
-TERRAIN = (GROUND, 9, 11)
+TERRAIN = (GROUND, WATER, 11)
+#: Wires, towers and what connects them: no part of a canopy.
+WIRES_AND_TOWERS = (13, 14, 15, 16)
 #: Codes that say nothing about the object: never classified, unclassified.
 UNLABELED = (0, 1)
 #: Overlap of strips, before LAS 1.4 had a flag for it.

@@ -20,6 +20,7 @@ COMMANDS = {
     "models": ("models", "train", "accuracy", "model"),
     "pipelines": ("pipeline", "expand", "validate"),
     "installation": ("drivers", "options", "doctor", "plugin", "warmup"),
+    "deliverables": ("surfaces", "report"),
     "extras": ("objects", "review", "corrections", "demo"),
 }
 OVERRIDES = "Stages take options as in PDAL: --stage.TAG.option=V, --filters.name.option=V"

@@ -38,6 +38,16 @@ def run_files(options: argparse.Namespace) -> list[Output]:
 def add_tile_options(command: Parser, survey: bool = False) -> None:
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
     when = "Several inputs and large files are cut into tiles" if survey else "Run in tiles"
+    add = add_survey_options(command, when)
+    add("--per", choices=PER, default="file", help="One output per input file or per tile")
+    buffer = argparse.SUPPRESS if survey else "How far PDAL's own filters look beyond a tile"
+    add("--buffer", type=float, metavar="METERS", help=buffer)
+    add("--dry-run", action="store_true", help="Show tiles, memory and disk needed, then stop")
+    add("--report", metavar="FILE", help="Write counts of outputs, tiles, classes to a JSON file")
+
+
+def add_survey_options(command: Parser, when: str) -> Callable:
+    """Add the flags of all commands that read surveys in tiles; return what adds others."""
     group = command.add_argument_group("large areas", f"{when} (docs/large-areas.md).")
     add = command.adder_to(group)
     side = "Side of the tiles in the cloud's unit (default: auto)"
@@ -47,12 +57,8 @@ def add_tile_options(command: Parser, survey: bool = False) -> None:
     add("--workers", type=int, metavar="N", help=workers)
     scheduler = "A running Dask scheduler, tcp://HOST:8786"
     add("--scheduler", default="", metavar="ADDRESS", help=scheduler)
-    add("--per", choices=PER, default="file", help="One output per input file or per tile")
-    buffer = argparse.SUPPRESS if survey else "How far PDAL's own filters look beyond a tile"
-    add("--buffer", type=float, metavar="METERS", help=buffer)
     add("--resume", action="store_true", help="Continue a run that was stopped or failed")
-    add("--dry-run", action="store_true", help="Show tiles, memory and disk needed, then stop")
-    add("--report", metavar="FILE", help="Write counts of outputs, tiles, classes to a JSON file")
+    return add
 
 
 def _tile_side(text: str) -> float | str:

@@ -25,6 +25,7 @@ from . import install
 _EXTRAS = {
     "dask": ("distributed", "tiles on several hosts"),
     "deep": ("torch", "the neural network"),
+    "raster": ("rasterio", "terrain and surface as rasters"),
     "vector": ("pyogrio", "objects as vector files, and polygons of a map"),
 }
 #: Bytes of free memory that a job needs besides the cloud; less is reported.

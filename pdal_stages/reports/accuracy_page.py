@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import percent
-from ..base.asprs import class_color
+from ..base.asprs import class_color, class_name
 from ..base.files import write_whole
 from ..base.messages import plain
 from ..base.version import __version__
@@ -85,7 +85,8 @@ def write_accuracy_report(
     names = [place.name if len(places) > 1 else "" for place in places[:MAX_PLACES]]
     maps = [_maps(accuracy, place) for place in places[:MAX_PLACES]]
     ordered = sorted((importances or {}).items(), key=lambda item: (-item[1], item[0]))
-    page = _render(
+    page = render_page(
+        "accuracy.html",
         title=title,
         subtitle=subtitle,
         a=accuracy,
@@ -138,10 +139,10 @@ def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
     }
 
 
-def _render(**context: Any) -> str:
-    """Return the page, self-contained and without scripts; all values are escaped."""
+def render_page(template: str, **context: Any) -> str:
+    """Return a page, self-contained and without scripts; all values are escaped."""
     context = {"version": __version__, "date": _today(), **context}
-    page = _templates().get_template("accuracy.html").render(context)
+    page = _templates().get_template(template).render(context)
     # Names of files may hold bytes that are not UTF-8, or control characters.
     return plain(page.encode(errors="backslashreplace").decode())
 
@@ -156,7 +157,7 @@ def _templates() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters.update(percent=percent, count=lambda n: f"{n:,}", flat=flat)
-    environment.globals.update(class_color=class_color)
+    environment.globals.update(class_color=class_color, class_name=class_name)
     return environment
 
 

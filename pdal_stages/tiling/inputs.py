@@ -169,10 +169,12 @@ class Survey:
         self._read_headers()
         #: What each of the writers writes of each input; empty where each tile is an output.
         self.outputs = outputs_for(plan, self.paths) if options.per == "file" else []
-        self.unit = self._unit(plan, options.per)  #: meters per unit of the coordinates
+        #: of the first input that has one
+        self.reference = self._reference(plan, options.per)
+        self.unit = self.reference.units.horizontal  #: meters per unit of the coordinates
         self.halo_units = plan.halo_m / self.unit  #: of a tile, in the unit of the coordinates
         self.place()
-        self.density = Density.measure(filter(None, (source.extent for source in self.sources)))
+        self.density = self.measure_density()
         #: Memory of a worker for the rounds before the tiles.
         self.block_bytes = (
             block_bytes(plan.blocks, self.density.area * self.unit**2) if plan.blocks else 0.0
@@ -204,10 +206,14 @@ class Survey:
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
         self.messages += [f"{message}{more}" for message in odd[:1]]
 
-    def _unit(self, plan: TilePlan, per: str) -> float:
-        """Return meters per unit of the coordinates.
+    def measure_density(self) -> Density:
+        """Return the density of the inputs, by which tiles are chosen."""
+        return Density.measure(filter(None, (source.extent for source in self.sources)))
 
-        Inputs that stages see together must have the same reference.
+    def _reference(self, plan: TilePlan, per: str) -> Reference:
+        """Return the reference of the inputs, that of the first where no stage needs one.
+
+        Inputs that stages see together must have the same.
         """
         needed = bool(plan.head and plan.sees_m)
         known: dict[str, Reference] = {}  # PDAL is asked once for equal references
@@ -237,7 +243,8 @@ class Survey:
                     "both"
                 )
             self.messages += messages
-        return next(iter(references.values())).units.horizontal
+        first, *others = references.values()
+        return next((each for each in others if each.name and not first.name), first)
 
     @property
     def layout(self) -> dict[str, float]:

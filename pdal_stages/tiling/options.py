@@ -244,6 +244,11 @@ class Density:
                 return grid
         return None
 
+    @property
+    def alone(self) -> int:
+        """Return the points of the only tile of a small survey."""
+        return self.points
+
     def read_by(self, side: float, halo_units: float) -> int:
         """Return the points of a tile of this side with its halo."""
         return min(self.points, math.ceil(self.each * (side + 2 * halo_units) ** 2))
@@ -289,7 +294,7 @@ def choose_tiles(
     alone = density.grid_around() if may_be_alone and small else None
     if alone is not None:
         free = whole - (PARENT if local else 0)
-        if worker_bytes(density.points, largest) <= free:
+        if worker_bytes(density.alone, largest) <= free:
             workers = local if fixed else min(local, 1)
             return replace(options, tile=alone.size, workers=workers), alone
     for workers in [local] if fixed else range(local, 0, -1):

@@ -124,7 +124,7 @@ def run_plan(
             store.clear()
         store.finish("run", "", survey.layout)
         try:
-            with _workers(survey.options, str(store.folder)) as workers:
+            with workers_of(survey.options, str(store.folder)) as workers:
                 run = _Run(plan, survey, store, workers, progress)
                 run.read_inputs()
                 run.find_jobs()
@@ -146,7 +146,7 @@ def run_plan(
     return result
 
 
-def _workers(options: TilingOptions, folder: str) -> Any:
+def workers_of(options: TilingOptions, folder: str) -> Any:
     """Return the workers of a run whose working folder is `folder`."""
     if options.scheduler:
         from .dask_workers import Cluster
@@ -168,43 +168,16 @@ def _try_on_an_input(pipeline: Pipeline, survey: Survey, readers: int) -> None:
         Pipeline(trial, whole=False, ready=pipeline.expanded.ours).prepare()
 
 
-class _Run:
-    """The state of a run: jobs that are to be done, and that are done."""
+class SurveyRun:
+    """A survey, the working folder and the workers of a run; it reads inputs and runs jobs."""
 
-    def __init__(
-        self, plan: TilePlan, survey: Survey, store: Store, workers: Any, show: bool | None
-    ) -> None:
-        self.plan, self.survey, self.store = plan, survey, store
+    def __init__(self, survey: Survey, store: Store, workers: Any, show: bool | None) -> None:
+        self.survey, self.store = survey, store
         self.workers, self.show = workers, show
-        self.tiles: list[Job] = []  #: with points of their own, row by row
-        self.squares: list[Job] = []  #: of the rounds before the last
-        self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
         self.cpu_seconds = 0.0  #: of tasks, including failed ones
         self.peak_mb = 0.0  #: peak memory of a process
-        self.messages_before: list[list[str]] = []  #: of the rounds before the last
-        #: How far around a tile, in units of the coordinates, inputs are available: its halo may
-        #: have to grow (four halos are room for that, not tuned).
-        halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
-        self.farthest = max(4 * survey.halo_units, halo_units + survey.grid.size)
 
-    def result(self, seconds: float) -> TiledRun:
-        """Return what was done in a time."""
-        survey = self.survey
-        summary = survey.figures(self.plan) | {
-            "workers": self.workers.slots,
-            "threads_per_worker": self.workers.threads,
-            **summarize(self.tiles, self.squares, self.cpu_seconds, seconds),
-            "peak_mb_of_a_worker": self.peak_mb,
-        }
-        most = survey.options.most_points
-        messages = messages_of(self.tiles, self.squares, self.messages_before, most)
-        if any(NO_REFERENCE in text for text in survey.messages):  # it tells what is assumed
-            messages = [text for text in messages if METERS_ASSUMED not in text]
-        messages = survey.messages + messages
-        changed = survey.changed()
-        return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
-
-    def _do(
+    def do(
         self, what: str, waiting: deque[Job], task_of: Callable[[Job], Callable[[], Any]]
     ) -> Iterator[Job]:
         """Run jobs as workers become free, save their records, and yield each.
@@ -238,8 +211,6 @@ class _Run:
                 if not done:
                     _stop_if_hopeless(failures)
 
-    # ---- inputs ----------------------------------------------------------------------------------
-
     def read_inputs(self, needed: Collection[str] = ()) -> None:
         """Read files once, sort their points by location, and save their index.
 
@@ -268,7 +239,7 @@ class _Run:
             assert job.source is not None
             return partial(sort_points, job.source.path, survey.grid, copy_of(job))
 
-        for job in self._do("reading the inputs", waiting, task_of):
+        for job in self.do("reading the inputs", waiting, task_of):
             assert job.source is not None
             if f"the {TEMPORARY} file" in job.reason:  # the input is not the cause
                 raise StageError(job.reason)
@@ -281,6 +252,51 @@ class _Run:
                     )
         survey.place()
 
+    def unkept(self, jobs: Iterable[Job]) -> deque[Job]:
+        """Return the waiting jobs that no earlier run has finished."""
+        waiting = deque(job for job in jobs if job.state == "waiting")
+        for job in waiting:
+            if known := self.store.finished(job.name, job.mark):
+                job.state, job.record = "kept", known
+        return deque(job for job in waiting if job.state == "waiting")
+
+
+class _Run(SurveyRun):
+    """The state of a run of a plan: jobs that are to be done, and that are done."""
+
+    def __init__(
+        self, plan: TilePlan, survey: Survey, store: Store, workers: Any, show: bool | None
+    ) -> None:
+        super().__init__(survey, store, workers, show)
+        self.plan = plan
+        self.tiles: list[Job] = []  #: with points of their own, row by row
+        self.squares: list[Job] = []  #: of the rounds before the last
+        self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
+        self.messages_before: list[list[str]] = []  #: of the rounds before the last
+        #: How far around a tile, in units of the coordinates, inputs are available: its halo may
+        #: have to grow (four halos are room for that, not tuned).
+        halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
+        self.farthest = max(4 * survey.halo_units, halo_units + survey.grid.size)
+
+    def result(self, seconds: float) -> TiledRun:
+        """Return what was done in a time."""
+        survey = self.survey
+        summary = survey.figures(self.plan) | {
+            "workers": self.workers.slots,
+            "threads_per_worker": self.workers.threads,
+            **summarize(self.tiles, self.squares, self.cpu_seconds, seconds),
+            "peak_mb_of_a_worker": self.peak_mb,
+        }
+        most = survey.options.most_points
+        messages = messages_of(self.tiles, self.squares, self.messages_before, most)
+        if any(NO_REFERENCE in text for text in survey.messages):  # it tells what is assumed
+            messages = [text for text in messages if METERS_ASSUMED not in text]
+        messages = survey.messages + messages
+        changed = survey.changed()
+        return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
+
+    # ---- tiles and outputs -----------------------------------------------------------------------
+
     def inputs_of_waiting(self) -> set[str]:
         """Return the inputs whose points waiting tiles and their rounds read."""
         far = len(self.plan.rounds) * (self.farthest + self.survey.squares.size)
@@ -288,8 +304,6 @@ class _Run:
             far += (self.plan.sees_m + blocks.side + blocks.reach) / self.survey.unit
         waiting = [job.tile for job in self.tiles if job.state == "waiting"]
         return {source.path for tile in waiting for source in self.survey.near(tile, far)}
-
-    # ---- tiles and outputs -----------------------------------------------------------------------
 
     def find_jobs(self) -> None:
         """Find all tiles and outputs; those with unreadable inputs fail.
@@ -332,8 +346,8 @@ class _Run:
 
     def take_over(self) -> None:
         """Keep the results of an earlier run; tiles that no output needs are not run again."""
-        needed = {job.name for out in self._unkept(self.outputs) for job in out.jobs}
-        self._unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
+        needed = {job.name for out in self.unkept(self.outputs) for job in out.jobs}
+        self.unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
         for job in self.tiles:
             if job.state == "waiting" and job.outputs is None and job.name not in needed:
                 known = self.store.note(job.name)
@@ -341,14 +355,6 @@ class _Run:
                     "kept",
                     known if known.get("fingerprint") == job.mark else {},
                 )
-
-    def _unkept(self, jobs: Iterable[Job]) -> deque[Job]:
-        """Return the waiting jobs that no earlier run has finished."""
-        waiting = deque(job for job in jobs if job.state == "waiting")
-        for job in waiting:
-            if known := self.store.finished(job.name, job.mark):
-                job.state, job.record = "kept", known
-        return deque(job for job in waiting if job.state == "waiting")
 
     @cached_property
     def _context(self) -> RunContext:
@@ -384,7 +390,7 @@ class _Run:
             plan, scratch = context.plan, context.scratch
             return partial(write_file, plan, job.source, results, job.outputs, scratch)
 
-        for job in self._do("tiles", waiting, task_of):
+        for job in self.do("tiles", waiting, task_of):
             written = job.state == "done" and job.outputs and job.record["outputs"]
             if finished is not None and written:
                 finished(job)
@@ -431,11 +437,11 @@ class _Run:
                 job.fail_with(job.jobs)
             label = f"round {number + 1}"
             task_of = partial(self._tile_task, number)
-            for job in self._do(label, self._unkept(squares), task_of):
+            for job in self.do(label, self.unkept(squares), task_of):
                 self.messages_before.append(job.record.get("messages", []))
             for job in blocks:
                 job.fail_with(job.jobs)
-            for _ in self._do(f"{label}, blocks", self._unkept(blocks), self._block_task):
+            for _ in self.do(f"{label}, blocks", self.unkept(blocks), self._block_task):
                 pass
             self.squares += squares
         for job in waiting:

@@ -25,6 +25,7 @@ _CORRECTED = (
     "Point clouds, tables, layers (*.laz *.las *.csv *.gpkg *.geojson *.fgb *.shp);;All files (*)"
 )
 _MODELS = "Model files (*.model);;All files (*)"
+_TABLES = "Tables (*.csv *.txt);;All files (*)"
 _PAGES = "Pages (*.html)"
 _REPORTS = "Reports (*.json)"
 _SHOW = "Show the result on the map"
@@ -52,6 +53,8 @@ class _Showing(Algorithm):
         for kind, path in self.to_show:
             if kind == "vector":
                 layers = results.vector_layers(path)
+            elif kind == "raster":
+                layers = [results.raster_layer(path)]
             elif results.shows_point_clouds():
                 layers = [results.point_cloud(path, self.forms["classes"])]
             else:
@@ -319,6 +322,39 @@ class TerrainModels(_Showing):
         return chosen
 
 
+class Surfaces(_Showing):
+    """Rasters of a classified survey."""
+
+    key, title, command = (
+        "surfaces",
+        "Terrain, surface and canopy of classified point clouds",
+        "surfaces",
+    )
+    about = (
+        "Makes rasters of classified point clouds of any number: the terrain through the ground "
+        "points, the surface as the highest point of each cell, and the canopy as what is above "
+        "the terrain, on one grid without seams. The points must be classified."
+    )
+    listed = ("resolution", "fill", "max_radius", "resume")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_inputs(self.help_of("inputs"))
+        self.add_declared()
+        self.addParameter(
+            QgsProcessingParameterFolderDestination("OUTPUT", "Folder of the rasters")
+        )
+        self.add_show()
+
+    def processAlgorithm(self, parameters, context, feedback):
+        target = written(self.parameterAsString(parameters, "OUTPUT", context), folder=True)
+        chosen = [*self.arguments(parameters, context), *self.inputs(parameters, context)]
+        self.execute(["surfaces", *chosen, target], feedback)
+        names = [os.path.join(target, f"{name}.tif") for name in results.SURFACES]
+        if self.parameterAsBool(parameters, "SHOW", context):
+            self.to_show += [("raster", path) for path in names]
+        return {"OUTPUT": target}
+
+
 class Train(Algorithm):
     """Train a model file from labels."""
 
@@ -395,6 +431,35 @@ class Accuracy(Algorithm):
             "FIGURES": text,
             **({"JSON": figures} if figures else {}),
         }
+
+
+class Report(Algorithm):
+    """Write the page by which a survey is accepted."""
+
+    key, title, command = "report", "Report of a survey", "report"
+    about = (
+        "Measures classified point clouds: density, voids, heights of strips against each other, "
+        "and control points from a table. The page is under Processing > Results Viewer."
+    )
+    listed = ("density", "void")
+    handled = ("control", "json")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_inputs(self.help_of("inputs"))
+        self.add_file("CONTROL", "Control points", self.help_of("control"), _TABLES, optional=True)
+        self.add_declared()
+        self.add_destination("PAGE", "Report", files=_PAGES)
+        self.addOutput(QgsProcessingOutputHtml("HTML", "Report"))
+
+    def processAlgorithm(self, parameters, context, feedback):
+        page = self.destination(parameters, "PAGE", context)
+        control = self.parameterAsFile(parameters, "CONTROL", context)
+        chosen = [
+            *self.arguments(parameters, context),
+            *([f"--control={control}"] if control else []),
+        ]
+        self.execute(["report", *chosen, *self.inputs(parameters, context), page], feedback)
+        return {"PAGE": page, "HTML": page}
 
 
 class Objects(_Showing):
@@ -499,6 +564,8 @@ ALGORITHMS = (
     ClassifySurvey,
     Heights,
     TerrainModels,
+    Surfaces,
+    Report,
     Train,
     Accuracy,
     Review,

@@ -10,6 +10,7 @@ from qgis.core import (
     QgsPointCloudLayer,
     QgsProcessingLayerPostProcessorInterface,
     QgsProviderRegistry,
+    QgsRasterLayer,
     QgsSingleBandPseudoColorRenderer,
     QgsStyle,
     QgsVectorLayer,
@@ -18,6 +19,8 @@ from qgis.PyQt.QtGui import QColor
 
 #: Layers of objects and of what is to be reviewed, the lowest on the map first.
 LAYERS = ("tiles", "patches", "buildings", "decks", "crowns", "spans", "trees")
+#: Rasters of the command ``surfaces``, the lowest on the map first.
+SURFACES = ("terrain", "surface", "canopy")
 
 
 def shows_point_clouds():
@@ -57,6 +60,15 @@ def vector_layers(path):
                 layer.setOpacity(0.5)
             layers.append(layer)
     return layers
+
+
+def raster_layer(path):
+    """Return a layer of a raster of the command ``surfaces``: shaded relief, or colored heights."""
+    name = os.path.splitext(os.path.basename(path))[0]
+    layer = QgsRasterLayer(str(path), name, "gdal")
+    if layer.isValid():
+        (heights if name == "canopy" else hillshade)(layer)
+    return layer
 
 
 class Style(QgsProcessingLayerPostProcessorInterface):

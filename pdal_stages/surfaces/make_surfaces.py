@@ -1,0 +1,156 @@
+"""Write terrain, surface and canopy of classified files, of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import StageError, optional_import
+from ..base.files import Output, check_outputs
+from ..base.grid import GridWindow
+from ..base.hashing import fingerprint
+from ..pipeline.inputs_outputs import input_files
+from ..tiling.inputs import Survey
+from ..tiling.jobs import Job, load_arrays
+from ..tiling.options import Density, TilingOptions
+from ..tiling.tile_records import RecordRun, earlier_layout, plan_of_records, record_run
+from .cells import STEPS, CellDensity, SurfaceOptions, reduce_points
+from .geotiff import raster, write_rasters
+from .rasters import RASTERS, TileCells, compute_tile
+
+#: What the arrays of tiles are named after: of cells, and of rasters.
+_CELLS, _RASTERS = "cells", "rasters"
+
+
+class CellSurvey(Survey):
+    """A survey whose tiles are chosen for the memory of cells, too."""
+
+    def __init__(
+        self,
+        files: Sequence[str],
+        folder: Path,
+        tiling: TilingOptions,
+        cell_options: SurfaceOptions,
+    ) -> None:
+        """Find and check the inputs, and choose tiles."""
+        self.cell_options = cell_options
+        plan = plan_of_records("surfaces", files)
+        super().__init__(plan, tiling, earlier_layout(folder, tiling))
+
+    def measure_density(self) -> Density:
+        """Return the density of points, with that of cells."""
+        density = super().measure_density()
+        return CellDensity(**vars(density), options=self.cell_options, unit=self.unit)
+
+
+def write_surfaces(
+    inputs: Sequence[str],
+    folder: str,
+    options: SurfaceOptions | None = None,
+    tiling: TilingOptions | None = None,
+    progress: bool | None = None,
+) -> dict[str, Any]:
+    """Write ``terrain.tif``, ``surface.tif`` and ``canopy.tif`` of classified files.
+
+    Parameters
+    ----------
+    inputs : sequence of str
+        LAS, LAZ or COPC files, folders or patterns.
+    folder : str
+        Folder of the rasters, which is created where it is missing.
+    options : SurfaceOptions, optional
+    tiling : TilingOptions, optional
+        As of ``classify``.
+    progress : bool, optional
+        Whether to show progress on stderr.
+
+    Returns
+    -------
+    dict
+        ``files``, ``width`` and ``height`` in cells, and ``known``: cells with a height by raster.
+
+    Raises
+    ------
+    StageError
+        Where no point is ground, references differ, or a file cannot be read or written.
+    """
+    raster()  # before any work
+    optional_import("startinpy", "raster", "a terrain model")
+    files = input_files(inputs)
+    place = Path(folder)
+    paths = {name: place / f"{name}.tif" for name in RASTERS}
+    if place.is_dir():
+        check_outputs([Output(str(path), "raster") for path in paths.values()], files)
+    options, chosen = options or SurfaceOptions(), replace(tiling or TilingOptions(), per="tile")
+    survey = CellSurvey(files, place, chosen, options)
+    place.mkdir(parents=True, exist_ok=True)
+    check_outputs([Output(str(path), "raster") for path in paths.values()], files)
+    with record_run(survey, chosen, place, progress) as run:
+        return _run(run, paths, options)
+
+
+def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> dict[str, Any]:
+    """Compute all tiles, and write the rasters."""
+    survey = run.survey
+    reduce = partial(reduce_points, options=options, unit=survey.unit)
+    reduced = run.reduce(_CELLS, asdict(options), reduce)
+    if not any(job.record["ground"] for job in reduced):
+        raise StageError(
+            "no point is ground (classes 2, 9, 11), so there is no terrain",
+            found=", ".join(survey.paths[:3]),
+            cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
+        )
+    window = enclose(GridWindow(*job.record["window"]) for job in reduced)
+    size = options.resolution
+    x0, y0, wide, tall = (number * size for number in window)
+    box = x0, y0, x0 + wide, y0 + tall
+    files = {job.tile: run.path_of(job) for job in reduced}
+    in_steps = tuple(side * STEPS for side in box)
+    cells = TileCells(options, survey.grid, survey.unit, in_steps, files)  # type: ignore[arg-type]
+    marks = {job.tile: job.mark for job in reduced}
+    points = {job.tile: job.points for job in reduced}
+    centers = x0 + size / 2, y0 + size / 2, x0 + wide - size / 2, y0 + tall - size / 2
+    near = {tile: cells.near(tile, cells.reach) for tile in survey.grid.covering(centers)}
+    jobs = [
+        Job(
+            f"{survey.grid.name(tile)}.{_RASTERS}",
+            points.get(tile, 1),
+            tile,
+            mark=fingerprint(window, [marks[other] for other in around.files]),
+        )
+        for tile, around in near.items()
+        if around.files
+    ]
+
+    def task_of(job: Job) -> Callable[[], Any]:
+        return partial(compute_tile, near[job.tile], job.tile, run.path_of(job))
+
+    run.compute("surfaces", jobs, task_of)
+
+    def parts(name: str) -> Iterator[tuple[GridWindow, NDArray]]:
+        for job in jobs:
+            arrays = load_arrays(run.path_of(job), (name, "window"))
+            yield GridWindow(*arrays["window"].tolist()), arrays[name]
+
+    write_rasters(paths, parts, window, size, survey.reference, RASTERS)
+    run.forget((_CELLS, _RASTERS))
+    known = {name: sum(job.record[name] for job in jobs) for name in RASTERS}
+    shown = {name: str(path) for name, path in paths.items()}
+    return {"files": shown, "width": window.width, "height": window.height, "known": known}
+
+
+def enclose(windows: Iterable[GridWindow]) -> GridWindow:
+    """Return the smallest window with all cells of windows, of which empty ones do not count."""
+    corners = [
+        ([w.left, w.left + w.width - 1], [w.bottom, w.bottom + w.height - 1])
+        for w in windows
+        if w.width
+    ]
+    columns, rows = np.array(corners).transpose(1, 0, 2)
+    return GridWindow.enclosing(columns, rows)

@@ -1,0 +1,171 @@
+"""Terrain, surface and canopy of a tile, from the cells of the tiles around it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..base.errors import optional_import
+from ..base.grid import GridWindow
+from ..tiling.jobs import load_arrays, save_arrays
+from ..tiling.options import Box, TileGrid, touching
+from .cells import EMPTY, STEPS, Integers, SurfaceOptions, lowest
+from .triangulation import heights_at
+
+#: The rasters, and what they hold.
+RASTERS = {
+    "terrain": "Height of the ground",
+    "surface": "Height of the highest point",
+    "canopy": "Height above the ground of the highest point that is no wire or tower",
+}
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TileCells:
+    """What the tiles of a survey were reduced to, by :func:`.cells.reduce_points`."""
+
+    options: SurfaceOptions
+    grid: TileGrid
+    unit: float  #: meters per unit of the coordinates
+    bounds: Box  #: of all points, in steps
+    files: Mapping[tuple[int, int], str]  #: the arrays of each tile with points
+
+    @property
+    def reach(self) -> float:
+        """Return how far around a tile ground points matter, in the unit of the coordinates."""
+        return 2 * self.options.max_radius / self.unit
+
+    def own_cells(self, tile: tuple[int, int]) -> GridWindow:
+        """Return the cells whose centers lie in a tile."""
+        sides = []
+        for number, low in zip(tile, self.grid.box(tile)[:2], strict=True):
+            first = math.floor(low / self.options.resolution) - 1
+            count = math.ceil(self.grid.size / self.options.resolution) + 3
+            cells = first + np.arange(count, dtype=float)
+            sides.append(cells[self.grid.index((cells + 0.5) * self.options.resolution) == number])
+        if not all(map(len, sides)):
+            return GridWindow(0, 0, 0, 0)
+        return GridWindow.enclosing(*(side.astype(np.int64) for side in sides))
+
+    def near(self, tile: tuple[int, int], reach: float) -> TileCells:
+        """Return these cells with the files near a tile alone."""
+        width = math.ceil((reach + self.options.resolution) / self.grid.size)
+        around = range(-width, width + 1)
+        places = [(tile[0] + i, tile[1] + j) for j in around for i in around]
+        files = {place: self.files[place] for place in places if place in self.files}
+        return TileCells(self.options, self.grid, self.unit, self.bounds, files)
+
+    def load(self, box: Box, names: tuple[str, ...]) -> list[dict[str, NDArray]]:
+        """Return some arrays of the tiles that share a point with a box, in steps."""
+        size = self.options.resolution
+        x0, y0, x1, y1 = (side / STEPS for side in box)
+        wide = x0 - size, y0 - size, x1 + size, y1 + size
+        there = touching([self.grid.box(tile) for tile in self.files], wide)
+        files = list(self.files.values())
+        return [load_arrays(files[n], names) for n in there]
+
+    def ground(self, box: Box) -> Integers:
+        """Return the ground points (n, 3) in a box, in steps, as triangles need them."""
+        parts = [np.empty((0, 3), np.int64)]
+        for arrays in self.load(box, ("ground",)):
+            x, y, _ = arrays["ground"].T
+            inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
+            parts.append(arrays["ground"][inside])
+        return lowest(np.concatenate(parts), self.options.ground_step(self.unit))
+
+    def highest(self, window: GridWindow) -> tuple[Integers, Integers]:
+        """Return the arrays ``top`` and ``solid`` of a window of cells."""
+        step = self.options.step
+        low = window.left * step, window.bottom * step
+        box = *low, low[0] + window.width * step, low[1] + window.height * step
+        out = tuple(np.full(window.shape, EMPTY) for _ in range(2))
+        for arrays in self.load(box, ("window", "top", "solid")):
+            part = GridWindow(*arrays["window"].tolist())
+            both = window.intersect(part)
+            for raster, name in zip(out, ("top", "solid"), strict=True):
+                place = raster[both.slices_in(window)]
+                np.maximum(place, arrays[name][both.slices_in(part)], out=place)
+        return out[0], out[1]
+
+
+def compute_tile(cells: TileCells, tile: tuple[int, int], target: str) -> dict[str, Any]:
+    """Compute the rasters of a tile, save them, and return how many cells of each are known.
+
+    The arrays are named as in :data:`RASTERS`, (rows, columns) float32 from the south with NaN for
+    no height; ``window`` tells which cells they are.
+    """
+    options, window = cells.options, cells.own_cells(tile)
+    arrays = {name: np.empty((0, 0)) for name in RASTERS}
+    if window.width and window.height:
+        terrain = _terrain(cells, window)
+        reach = options.fill / cells.unit / options.resolution
+        around = window.padded(2 * math.ceil(reach) + 2)
+        inner = window.slices_in(around)
+        top, solid = (fill(level, terrain, inner, reach) for level in cells.highest(around))
+        canopy = np.maximum(solid - terrain, 0.0)  # NaN stays
+        arrays = {"terrain": terrain, "surface": top, "canopy": canopy}
+    rounded = {name: np.round(values, 3).astype(np.float32) for name, values in arrays.items()}
+    save_arrays(target, {**rounded, "window": np.array(window)})
+    return {name: int(np.isfinite(values).sum()) for name, values in rounded.items()}
+
+
+def _terrain(cells: TileCells, window: GridWindow) -> Floats:
+    """Return the heights of the terrain in a window of cells, NaN for none."""
+    step = cells.options.step
+    x = (window.left + np.arange(window.width, dtype=float) + 0.5) * step
+    y = (window.bottom + np.arange(window.height, dtype=float) + 0.5) * step
+
+    def points_within(distance: float) -> Integers:
+        return cells.ground((x[0] - distance, y[0] - distance, x[-1] + distance, y[-1] + distance))
+
+    return heights_at((x, y), cells.reach * STEPS, cells.bounds, points_within) / STEPS
+
+
+def fill(
+    coded: Integers, terrain: Floats, inner: tuple[slice, slice], reach: float
+) -> NDArray[np.float64]:
+    """Return heights of cells, also of those without points between others; NaN for none.
+
+    Parameters
+    ----------
+    coded : (rows, columns) int64
+        Heights as of :func:`.cells.reduce_points`, with at least two `reach` around.
+    terrain : (rows, columns) float64
+        Of the inner cells: an empty one takes it where all neighbors with points are ground, and no
+        height is below it.
+    inner : pair of slice
+        Which cells are returned.
+    reach : float
+        How far others are interpolated, in cells.
+    """
+    known = coded != EMPTY
+    height = np.where(known, (coded >> 1) / STEPS, 0.0)
+    beside_any, beside_other = (
+        ndimage.maximum_filter(mask, 3, mode="constant")[inner]
+        for mask in (known, known & (coded & 1 == 1))
+    )
+    out = np.where(known, height, np.nan)[inner]
+    empty = np.isnan(out)
+    level = empty & beside_any & ~beside_other & np.isfinite(terrain)
+    out[level] = terrain[level]
+    # Morphological closing with a disk: cells between others, not those beyond the last.
+    between = (_distance_to(_distance_to(known) > reach) > reach)[inner] & empty & ~level
+    if between.any():
+        gdal_fill: Any = optional_import("rasterio.fill", "raster", "a surface model")
+        all_heights = gdal_fill.fillnodata(height.astype(np.float32), known, reach)
+        out[between] = all_heights[inner][between]
+    return np.where(np.isnan(out), np.nan, np.fmax(out, terrain))
+
+
+def _distance_to(cells: NDArray[np.bool_]) -> Floats:
+    """Return the distance of every cell to the nearest of some cells, infinite without any."""
+    if not cells.any():
+        return np.full(cells.shape, np.inf)
+    return ndimage.distance_transform_edt(~cells)

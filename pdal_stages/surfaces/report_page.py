@@ -1,0 +1,133 @@
+"""The page of the report of a survey, with its pictures."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..base.grid import GridWindow
+from ..base.messages import count_of
+from ..reports.accuracy_page import render_page
+from ..reports.pictures import (
+    CLASS_COLORS,
+    HEIGHT_COLORS,
+    Surface,
+    embed,
+    nice_step,
+    paint,
+    ramp,
+    shading,
+)
+from .cells import EMPTY, STEPS
+from .survey_cells import ReportRules
+
+#: Colors of density and of differences, from low to high.
+_DENSITY = ((247, 244, 236), (186, 216, 200), (84, 160, 176), (28, 78, 128), (20, 24, 70))
+_DIFFERENCES = ((44, 123, 182), (171, 217, 233), (255, 255, 191), (253, 174, 97), (215, 25, 28))
+#: Meters: differences of strips from which the last color is shown.
+_LARGE = 0.1
+_VOID = np.array([204, 24, 32])
+#: Least width of a picture in pixels.
+_LEAST = 400
+#: Pixels: farther ones take nothing from the nearest that has a point.
+_GAP = 2.0
+#: Widest scale bar as a part of a picture's width: one in this number.
+_SCALE_PART = 6
+#: Seconds from the beginning of GPS time to that of adjusted standard time, less 10**9.
+_GPS_EPOCH = datetime.datetime(1980, 1, 6, tzinfo=datetime.timezone.utc)
+
+
+@dataclass
+class Rasters:
+    """Rasters of a survey: their windows, and (rows, columns) from the south."""
+
+    rules: ReportRules
+    unit: float  #: meters per unit of the coordinates
+    of: dict[str, tuple[GridWindow, NDArray[np.int64]]]
+    strips: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 4), np.int64))
+    voids: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
+
+
+def render_report(result: Mapping[str, Any], rasters: Rasters) -> str:
+    """Return the page."""
+    top, side = rasters.of["picture"][1], rasters.rules.picture
+    away, at = ndimage.distance_transform_edt(top == EMPTY, return_indices=True)
+    known, top = away < _GAP, top[tuple(at)]
+    z = np.where(known, (top >> 8) / STEPS, np.nan) * rasters.rules.vertical
+    relief = Surface(0.0, 0.0, side * rasters.unit, np.where(known, 0, -1)[::-1], z[::-1], 1.0)
+    light, codes = shading(relief), np.where(known, top & 255, 0)[::-1]
+    per_m2 = rasters.of["all"][1] / (rasters.rules.density * rasters.unit) ** 2
+    most = result["density"]["ordered"] or float(np.percentile(per_m2[per_m2 > 0], 90))
+    density = ramp(np.where(per_m2 > 0, per_m2, np.nan), _DENSITY, (0.0, 2 * most))
+    held = np.where(rasters.of["void"][1] > 0, 235, 255)[..., None].repeat(3, axis=2)
+    held[rasters.voids > 0] = _VOID
+    meters = rasters.rules.density * rasters.unit
+    views = [
+        _view("Classes", paint(relief, CLASS_COLORS[codes], light), relief.pixel),
+        _view("Heights", paint(relief, ramp(relief.z, HEIGHT_COLORS), light), relief.pixel),
+        _view(
+            f"Points a m2, cells of {meters:g} m: white 0, dark {2 * most:.3g}",
+            density[::-1],
+            meters,
+        ),
+        _view("Voids: red", held[::-1].astype(np.uint8), rasters.rules.void * rasters.unit),
+    ]
+    if len(rasters.strips):
+        views.append(
+            _view(
+                f"Strips: RMS difference, blue 0, red {_LARGE:g} m", _strips(rasters)[::-1], meters
+            )
+        )
+    every = [(Path(path).name, described) for path, described in result["files"].items()]
+    return render_page(
+        "survey.html",
+        title="Survey report",
+        subtitle=f"{count_of(len(every), 'file')}, {result['reference'] or 'no reference system'}",
+        r=result,
+        files=every,
+        views=views,
+        codes=[int(code) for code in result["survey"]["classes"]],
+        time_span=_time_span(result["survey"]["times"]),
+    )
+
+
+def _strips(rasters: Rasters) -> NDArray[np.uint8]:
+    """Return a picture of the RMS differences of strips in cells of density, from the south."""
+    window, points = rasters.of["all"]
+    column, row, squares, count = rasters.strips.T
+    index, shape = window.flat_index(column, row), points.size
+    total, cells = (np.bincount(index, v, shape).reshape(points.shape) for v in (squares, count))
+    scale = rasters.unit * rasters.rules.vertical / STEPS
+    with np.errstate(invalid="ignore"):
+        return ramp(np.sqrt(total / cells) * scale, _DIFFERENCES, (0.0, _LARGE))
+
+
+def _view(heading: str, colors: NDArray[np.uint8], pixel_m: float) -> dict[str, Any]:
+    """Return a picture for the template, enlarged where it is small."""
+    times = max(1, _LEAST // colors.shape[1])
+    colors = colors.repeat(times, axis=0).repeat(times, axis=1)
+    wide = colors.shape[1] * pixel_m / times
+    length = nice_step(wide / _SCALE_PART)
+    return {
+        "heading": heading,
+        "alt": heading,
+        "scale": (100 * length / wide, f"{length:g} m"),
+        **embed(colors),
+    }
+
+
+def _time_span(times: tuple[float, float] | None) -> str:
+    """Return the first and the last time; GPS times beyond a week are dates."""
+    if times is None:
+        return ""
+    if max(times) <= 7 * 86400:
+        return f"{times[0]:,.0f} to {times[1]:,.0f} s of the GPS week"
+    dates = (_GPS_EPOCH + datetime.timedelta(seconds=value + 1e9) for value in times)
+    return " to ".join(date.strftime("%Y-%m-%d %H:%M") for date in dates)

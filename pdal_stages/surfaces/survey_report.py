@@ -1,0 +1,326 @@
+"""The report by which a survey is accepted: density, voids, strips, control points, pictures."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..base import checks
+from ..base.errors import StageError
+from ..base.files import HTML, JSON, Output, check_outputs, write_json, write_whole
+from ..base.grid import GridWindow
+from ..base.hashing import fingerprint
+from ..base.version import __version__
+from ..pipeline.inputs_outputs import input_files
+from ..tiling.inputs import Survey
+from ..tiling.jobs import Job, load_arrays
+from ..tiling.options import TilingOptions
+from ..tiling.tile_records import RecordRun, earlier_layout, plan_of_records, record_run
+from .cells import EMPTY, STEPS, SurfaceOptions, lowest
+from .make_surfaces import enclose
+from .rasters import TileCells
+from .report_page import Rasters, render_report
+from .survey_cells import ReportRules, combine, compare_strips, reduce_for_report
+from .triangulation import heights_at
+
+#: Width of pictures in pixels, and voids and control points that are listed, as many as fit a page.
+_WIDTH, _LISTED = 820, 10
+#: NSSDA: 95 % of normally distributed errors are smaller than this times their RMSE.
+NSSDA = 1.96
+#: What the arrays of tiles are named after.
+_REDUCED, _STRIPS = "report", "strips"
+_MERGES = {
+    "all": (np.add, 0),
+    "last": (np.add, 0),
+    "void": (np.maximum, 0),
+    "picture": (np.maximum, EMPTY),
+}
+
+
+def write_report(
+    inputs: Sequence[str],
+    page: str,
+    json_file: str = "",
+    density: float = 0.0,
+    void: float = 4.0,
+    control: str = "",
+    tiling: TilingOptions | None = None,
+    progress: bool | None = None,
+) -> dict[str, Any]:
+    """Write the report of a survey as an HTML page, and return it as JSON types.
+
+    Parameters
+    ----------
+    inputs : sequence of str
+        LAS, LAZ or COPC files, folders or patterns.
+    page : str
+        The HTML file.
+    json_file : str
+        A JSON file with the same figures; empty for none.
+    density : float
+        Points per square meter that were ordered; 0 if none were.
+    void : float
+        Area in m2 of a cell that should hold a point.
+    control : str
+        CSV file of control points: x, y, z in the units of the cloud, and a name.
+    tiling : TilingOptions, optional
+        As of ``classify``.
+    progress : bool, optional
+        Whether to show progress on stderr.
+    """
+    checks.number("--density", density, 0, 1e6)
+    checks.number("--void", void, 0.01, 1e4, unit="m2")
+    points = read_control(control)
+    outputs = [Output(page, "report", HTML)] + [Output(json_file, "json", JSON)] * bool(json_file)
+    files = input_files(inputs)
+    check_outputs(outputs, [*files, *([control] if control else [])])
+    chosen, folder = replace(tiling or TilingOptions(), per="tile"), Path(page).absolute().parent
+    survey = Survey(plan_of_records("report", files), chosen, earlier_layout(folder, chosen))
+    with record_run(survey, chosen, folder, progress) as run:
+        result, rasters = _measure(run, density, void, points)
+    write_whole(page, render_report(result, rasters).encode(errors="backslashreplace"), "report")
+    if json_file:
+        write_json(json_file, result, "json")
+    return result
+
+
+def read_control(path: str) -> list[tuple[float, float, float, str]]:
+    """Return the control points of a CSV file: x, y, z and a name, with or without a heading."""
+    points: list[tuple[float, float, float, str]] = []
+    if not path:
+        return points
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            for number, row in enumerate(csv.reader(file), 1):
+                try:
+                    x, y, z = map(float, row[:3])
+                except ValueError:
+                    if row and number > 1:
+                        place, cure = (
+                            f"{path}, line {number}",
+                            "Write x,y,z and, if you like, a name",
+                        )
+                        what = "a control point is not three numbers"
+                        raise StageError(
+                            what, where=place, found=",".join(row), cure=cure
+                        ) from None
+                    continue
+                points.append((x, y, z, ",".join(row[3:]).strip() or str(len(points) + 1)))
+    except (OSError, UnicodeError) as error:
+        raise StageError("the control points cannot be read", where=path, found=error) from None
+    if not points:
+        raise StageError("the file has no control points", where=path)
+    return points
+
+
+def _measure(
+    run: RecordRun, ordered: float, void: float, control: Sequence[tuple[float, float, float, str]]
+) -> tuple[dict[str, Any], Rasters]:
+    """Reduce all tiles; return the figures, and rasters to draw."""
+    survey, unit = run.survey, run.survey.unit
+    units = survey.reference.units
+    x0, y0, x1, y1 = survey.bounds
+    rules = ReportRules(
+        density=10.0 / unit,
+        void=math.sqrt(void) / unit,
+        strip=1.0 / unit,
+        picture=max(max(x1 - x0, y1 - y0) / _WIDTH, 2.0 / math.sqrt(survey.density.each)),
+        around_control=10.0 / unit,
+        vertical=units.vertical / units.horizontal,
+    )
+    places = np.array([point[:2] for point in control]).reshape(-1, 2)
+    settings = {**asdict(rules), "places": places.tolist()}
+    reduce = partial(reduce_for_report, rules=rules, control=places)
+    jobs = run.reduce(_REDUCED, settings, reduce)
+    files: dict[str, list[Any]] = {}
+    for job in jobs:
+        for path, described in job.record["files"].items():
+            files.setdefault(path, []).append(described)
+    by_file = {path: combine(files[path]) for path in survey.paths if path in files}
+    rasters = Rasters(rules, unit, {name: _merge(run, jobs, name) for name in _MERGES})
+    strips, rasters.strips = _strips(run, jobs, rules, units.vertical)
+    result = {
+        "version": __version__,
+        "reference": survey.reference.name,
+        "meters_per_unit": {"horizontal": units.horizontal, "vertical": units.vertical},
+        "survey": combine(by_file.values()),
+        "files": by_file,
+        **_density(rasters, ordered),
+        "strips": strips,
+        "control": _control(run, jobs, control, rules, units.vertical) if control else None,
+    }
+    run.forget((_REDUCED, _STRIPS))
+    return result, rasters
+
+
+def _merge(run: RecordRun, jobs: Sequence[Job], name: str) -> tuple[GridWindow, NDArray[np.int64]]:
+    """Return a raster of all tiles."""
+    merge, empty = _MERGES[name]
+    loaded = [load_arrays(run.path_of(job), (name, f"{name}_window")) for job in jobs]
+    windows = [GridWindow(*arrays[f"{name}_window"].tolist()) for arrays in loaded]
+    if not any(w.width for w in windows):
+        raise StageError("no point is neither noise nor withheld", found=run.survey.paths[0])
+    whole = enclose(windows)
+    out = np.full(whole.shape, empty)
+    for window, arrays in zip(windows, loaded, strict=True):
+        if window.width:
+            place = out[window.slices_in(whole)]
+            merge(place, arrays[name], out=place)
+    return whole, out
+
+
+def _density(rasters: Rasters, ordered: float) -> dict[str, Any]:
+    """Return figures of density and voids.
+
+    A cell of density counts if it and its eight neighbors have points, as those at the border are
+    filled in part. A void is a group of cells without points that others enclose; it is water if
+    half of the cells with points around it or more are.
+    """
+    side_m, cell_m = rasters.rules.density * rasters.unit, rasters.rules.void * rasters.unit
+    (_, all_points), (_, last) = rasters.of["all"], rasters.of["last"]
+    inner = ndimage.minimum_filter(all_points > 0, 3, mode="constant")
+    window, held = rasters.of["void"]
+    inside = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(held > 0, 2), iterations=2))
+    inside = inside[2:-2, 2:-2] | (held > 0)
+    label = ndimage.label(inside & (held == 0), np.ones((3, 3)))[0]
+    rasters.voids = label
+    area = inside.sum() * cell_m**2
+    density: dict[str, Any] = {
+        "cell_m": side_m,
+        "cells": int(inner.sum()),
+        "ordered": ordered or None,
+    }
+    for name, points in (("all", all_points), ("last", last)):
+        each = points[inner] / side_m**2
+        density[name] = {
+            "mean": float(points.sum() / area),
+            "median": float(np.median(each)) if len(each) else None,
+            "share_below": float((each < ordered).mean()) if ordered and len(each) else None,
+        }
+    voids: list[dict[str, Any]] = []
+    for number, box in enumerate(ndimage.find_objects(label), 1):
+        around = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box)
+        here = label[around] == number
+        border = ndimage.binary_dilation(here, np.ones((3, 3))) & (held[around] > 0)
+        if np.count_nonzero(held[around][border] == 2) < 0.5 * max(1, border.sum()):
+            row, column = (axis.mean() for axis in np.nonzero(label[box] == number))
+            cell = window.left + box[1].start + column, window.bottom + box[0].start + row
+            at = [round((value + 0.5) * rasters.rules.void, 2) for value in cell]
+            voids.append({"area_m2": float(here.sum() * cell_m**2), "at": at})
+        else:
+            rasters.voids[box][label[box] == number] = 0
+    voids.sort(key=lambda each: (-each["area_m2"], each["at"]))
+    figures = {
+        "cell_m2": cell_m**2,
+        "count": len(voids),
+        "area_m2": sum(each["area_m2"] for each in voids),
+        "share": sum(each["area_m2"] for each in voids) / area,
+        "largest": voids[:_LISTED],
+    }
+    return {"area_m2": float(area), "density": density, "voids": figures}
+
+
+def _strips(
+    run: RecordRun, jobs: Sequence[Job], rules: ReportRules, vertical: float
+) -> tuple[list[dict[str, Any]], NDArray[np.int64]]:
+    """Compare the ground of strips; return pairs, worst first, and cells of density with errors."""
+    grid, unit = run.survey.grid, run.survey.unit
+    files = {job.tile: run.path_of(job) for job in jobs}
+    marks = {job.tile: job.mark for job in jobs}
+    cells = TileCells(SurfaceOptions(rules.strip), grid, unit, (0.0, 0.0, 0.0, 0.0), files)
+    near = {job.tile: cells.near(job.tile, 2 * rules.strip).files for job in jobs}
+    compared = [
+        Job(
+            job.name.replace(_REDUCED, _STRIPS),
+            job.points,
+            job.tile,
+            mark=fingerprint(asdict(rules), [marks[tile] for tile in near[job.tile]]),
+        )
+        for job in jobs
+    ]
+
+    def task_of(job: Job) -> partial:
+        window, names = cells.own_cells(job.tile), list(near[job.tile].values())
+        return partial(compare_strips, names, window, rules, run.path_of(job))
+
+    run.compute("strips", compared, task_of)
+    loaded = [load_arrays(run.path_of(job)) for job in compared]
+    rows = np.concatenate([arrays["differences"] for arrays in loaded])
+    pairs: list[dict[str, Any]] = []
+    for a, b in np.unique(rows[:, :2], axis=0).tolist():
+        value, count = rows[(rows[:, 0] == a) & (rows[:, 1] == b)][:, 2:].T
+        order = np.argsort(value, kind="stable")
+        middle = np.searchsorted(np.cumsum(count[order]), count.sum() / 2)
+        scale = vertical / STEPS
+        rms = math.sqrt((value.astype(float) ** 2 * count).sum() / count.sum()) * scale
+        median = float(value[order][middle] * scale)
+        pairs.append(
+            {"strips": [a, b], "cells": int(count.sum()), "median_m": median, "rms_m": rms}
+        )
+    pairs.sort(key=lambda pair: (-pair["rms_m"], pair["strips"]))
+    return pairs, np.concatenate([arrays["cells"] for arrays in loaded])
+
+
+def _control(
+    run: RecordRun,
+    jobs: Sequence[Job],
+    control: Sequence[tuple[float, float, float, str]],
+    rules: ReportRules,
+    vertical: float,
+) -> dict[str, Any]:
+    """Compare the terrain, through all ground points, with control points."""
+    ground = np.concatenate(
+        [load_arrays(run.path_of(job), ("control",))["control"] for job in jobs]
+    )
+    ground = lowest(ground, 1.0)  # one of points at the same place
+    reach, everywhere = rules.around_control * STEPS, (math.inf, math.inf, -math.inf, -math.inf)
+    rows: list[dict[str, Any]] = []
+    outside = []
+    for x, y, z, name in control:
+        place = np.array([x, y]) * STEPS
+        near = ground[np.hypot(*(ground[:, :2] - place).T) <= reach]
+        height = heights_at((place[:1], place[1:]), reach, everywhere, partial(_all_of, near))
+        if np.isfinite(height[0, 0]):
+            difference = (height[0, 0] / STEPS - z) * vertical
+            rows.append({"name": name, "x": x, "y": y, "z": z, "difference_m": float(difference)})
+        else:
+            outside.append(name)
+    errors = np.array([row["difference_m"] for row in rows])
+    rows.sort(key=lambda row: -abs(row["difference_m"]))
+    out: dict[str, Any] = {"points": len(rows), "outside": outside, "worst": rows[:_LISTED]}
+    if rows:
+        rmse = float(np.sqrt((errors**2).mean()))
+        out |= {"mean_m": float(errors.mean()), "rmse_m": rmse, "nssda_95_m": NSSDA * rmse}
+    return out
+
+
+def _all_of(points: NDArray[np.int64], distance: float) -> NDArray[np.int64]:
+    """Return points, which are known at any distance."""
+    return points
+
+
+def lines(result: Mapping[str, Any]) -> list[str]:
+    """Return what the command prints of a report."""
+    density, voids, control = result["density"], result["voids"], result["control"]
+    out = [
+        f"{result['survey']['points']:,} points, {density['all']['mean']:.1f} a m2",
+        f"{voids['count']:,} voids, {voids['area_m2']:,.0f} m2 ({100 * voids['share']:.2f} %)",
+    ]
+    for pair in result["strips"][:1]:
+        out.append(
+            "strips {} and {}: median {:+.3f} m, RMS {:.3f} m".format(
+                *pair["strips"], pair["median_m"], pair["rms_m"]
+            )
+        )
+    if control and control["points"]:
+        out.append("control points: mean {mean_m:+.3f} m, RMSE {rmse_m:.3f} m".format(**control))
+    return out

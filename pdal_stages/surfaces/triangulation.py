@@ -1,0 +1,233 @@
+"""The Delaunay triangulation of ground points that is the same wherever a survey is cut.
+
+Coordinates are whole numbers, so that which points lie in which circle is decided exactly
+(startinpy, with robust predicates). Points on one circle have several Delaunay triangulations; here
+the first of them is joined to all others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..base.errors import optional_import
+from ..base.grid import begins_run
+from ..base.jit import njit
+
+Integers = NDArray[np.int64]
+#: Relative error of a determinant in doubles, rounded up (Shewchuk 1997: about 1.1e-15).
+_ROUNDING = 1e-14
+#: How triangles count: their circles reach beyond the known points; they give heights; they are too
+#: wide, so there is no height.
+UNKNOWN, VALID, TOO_WIDE = 0, 1, 2
+#: Where a place lies as seen from a triangle; a side belongs to both triangles of it.
+OUTSIDE, INSIDE, ON_SIDE = 0, 1, 2
+
+
+def triangulate(xy: Integers) -> Integers:
+    """Return the triangles (m, 3) of points, as ascending numbers of points.
+
+    Parameters
+    ----------
+    xy : (n, 2) int64
+        Different points, in an order that follows from coordinates alone; rows of points that lie
+        side by side make it fast.
+    """
+    return np.sort(_fan_circles(xy, _any_triangles(xy)), axis=1)
+
+
+def _any_triangles(xy: Integers) -> Integers:
+    """Return triangles (m, 3) of an exact Delaunay triangulation of points (n, 2)."""
+    startinpy: Any = optional_import("startinpy", "raster", "a terrain model")
+    network = startinpy.DT()
+    network.snap_tolerance = 1e-6
+    if len(xy) >= 3:
+        heights = np.zeros(len(xy))
+        network.insert(np.column_stack([xy - xy.min(axis=0), heights]).astype(np.float64))
+    triangles = np.asarray(network.triangles, np.int64).reshape(-1, 3)
+    return triangles - 1  # number 0 is the point at infinity
+
+
+def _fan_circles(xy: Integers, triangles: Integers) -> Integers:
+    """Replace triangles (m, 3) on one circle by a fan from the first of its points."""
+    if not len(triangles):
+        return triangles
+    sides = np.concatenate([triangles[:, [1, 2]], triangles[:, [2, 0]], triangles[:, [0, 1]]])
+    opposite, owner = triangles.T.reshape(-1), np.tile(np.arange(len(triangles)), 3)
+    key = sides.min(axis=1) * len(xy) + sides.max(axis=1)
+    order = np.argsort(key, kind="stable")
+    shared = np.flatnonzero(~begins_run(key[order]))
+    one, two = order[shared - 1], order[shared]
+    on_circle = _on_one_circle(xy, triangles[owner[one]], opposite[two])
+    one, two = owner[one[on_circle]], owner[two[on_circle]]
+    count = len(triangles)
+    pairs = coo_array((np.ones(len(one)), (one, two)), shape=(count, count))
+    group = connected_components(pairs, directed=False)[1]
+    several = np.bincount(group)[group] > 1
+    rest, group = triangles[several], np.repeat(group[several], 3)
+    # The points of each circle, once, the first of them in front.
+    at = np.lexsort((rest.reshape(-1), group))
+    group, point = group[at], rest.reshape(-1)[at]
+    once = begins_run(group) | begins_run(point)
+    group, point = group[once], point[once]
+    begins = begins_run(group)
+    first = point[begins][np.cumsum(begins) - 1]
+    away = (xy[point] - xy[first])[~begins]
+    group, point, first = group[~begins], point[~begins], first[~begins]
+    # From a point of a circle, the others lie within half a turn: the angle from the first of them
+    # orders them without a jump.
+    start = away[begins_run(group)][np.cumsum(begins_run(group)) - 1]
+    angle = np.arctan2(
+        (start[:, 0] * away[:, 1] - start[:, 1] * away[:, 0]).astype(float),
+        (start * away).sum(axis=1).astype(float),
+    )
+    at = np.lexsort((angle, group))
+    group, point, first = group[at], point[at], first[at]
+    next_to = np.flatnonzero(~begins_run(group))
+    fans = np.column_stack([first[next_to], point[next_to - 1], point[next_to]])
+    return np.concatenate([triangles[~several], fans])
+
+
+def _on_one_circle(xy: Integers, triangle: Integers, point: Integers) -> NDArray[np.bool_]:
+    """Return which points (k,) lie exactly on the circles of triangles (k, 3)."""
+    away = xy[triangle] - xy[point][:, None]
+    value, size = _in_circle(away.astype(np.float64))
+    zero = np.abs(value) <= _ROUNDING * size
+    exact, _ = _in_circle(away[zero].astype(object))  # integers of any length
+    zero[zero] = exact == 0
+    return zero
+
+
+def _in_circle(away: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the determinant (k,) that is 0 where three points (k, 3, 2) and 0 lie on a circle.
+
+    The second value is the sum of its terms' sizes.
+    """
+    x, y = away[..., 0], away[..., 1]
+    lift = x * x + y * y
+    value, size = 0, 0
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        value = value + lift[:, i] * (x[:, j] * y[:, k] - x[:, k] * y[:, j])
+        size = size + lift[:, i] * (abs(x[:, j] * y[:, k]) + abs(x[:, k] * y[:, j]))
+    return value, size  # type: ignore[return-value]
+
+
+def circles(xy: Integers, triangles: Integers) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return centers (m, 2) and radii (m,) of the circles of triangles (m, 3)."""
+    a = xy[triangles[:, 0]]
+    b, c = ((xy[triangles[:, k]] - a).astype(np.float64) for k in (1, 2))
+    area = 2.0 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
+    bb, cc = (b**2).sum(axis=1), (c**2).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = (c[:, 1] * bb - b[:, 1] * cc) / area
+        y = (b[:, 0] * cc - c[:, 0] * bb) / area
+    return a + np.column_stack([x, y]), np.hypot(x, y)
+
+
+def heights_at(
+    centers: tuple[NDArray[np.float64], NDArray[np.float64]],
+    reach: float,
+    bounds: tuple[float, float, float, float],
+    points_within: Callable[[float], Integers],
+) -> NDArray[np.float64]:
+    """Return heights (rows, columns) of the triangulation at the centers of cells; NaN for none.
+
+    Triangles count if the radius of their circle is at most half of `reach`: within that distance
+    lie all points that decide a cell. Fewer are read first, as few cells lie in wide triangles.
+
+    Parameters
+    ----------
+    centers : pair of (columns,) and (rows,) float64
+        Ascending x and y.
+    reach : float
+    bounds : tuple of float
+        West, south, east, north of all points there are.
+    points_within : callable
+        Returns the points (n, 3) within a distance of the centers' rectangle, different in x and y,
+        in the order of :func:`triangulate`.
+    """
+    x, y = centers
+    west, south, east, north = bounds
+    distance, out = reach / 16, np.full((len(y), len(x)), np.nan)
+    while True:
+        distance = min(2 * distance, reach)
+        points = points_within(distance)
+        box = x[0] - distance, y[0] - distance, x[-1] + distance, y[-1] + distance
+        triangles = triangulate(points[:, :2])
+        middle, radius = circles(points[:, :2], triangles)
+        # Where all points lie inside, a side of the box hides nothing.
+        low = np.where(np.less_equal(box[:2], (west, south)), -math.inf, box[:2])
+        high = np.where(np.greater_equal(box[2:], (east, north)), math.inf, box[2:])
+        r = radius[:, None] * (1 + 1e-9) + 1.0
+        known = (distance == reach) | ((middle - r >= low) & (middle + r <= high)).all(axis=1)
+        kind = np.where(known, np.where(radius <= reach / 2, VALID, TOO_WIDE), UNKNOWN)
+        open_cells = _fill(points.astype(np.float64), triangles, kind, x, y, out)
+        if distance == reach or not open_cells or not np.isfinite([low, high]).any():
+            return out
+
+
+@njit
+def _fill(points, triangles, kind, x, y, out):
+    """Write the heights of triangles into `out`; return how many cells no known one decides.
+
+    On a common side or corner the height follows from its two or one points alone, so that it does
+    not depend on the triangle.
+    """
+    height, width = out.shape
+    decided = np.zeros((height, width), np.bool_)
+    for t in range(len(triangles)):
+        if kind[t] == UNKNOWN:
+            continue
+        a, b, c = triangles[t]
+        low = min(points[a, 0], points[b, 0], points[c, 0])
+        high = max(points[a, 0], points[b, 0], points[c, 0])
+        first, last = np.searchsorted(x, low), np.searchsorted(x, high, "right")
+        low = min(points[a, 1], points[b, 1], points[c, 1])
+        high = max(points[a, 1], points[b, 1], points[c, 1])
+        for j in range(np.searchsorted(y, low), np.searchsorted(y, high, "right")):
+            for i in range(first, last):
+                z, place = _height_in(points, a, b, c, x[i], y[j])
+                if place != OUTSIDE and kind[t] == VALID:
+                    out[j, i] = z
+                if place == INSIDE or (place == ON_SIDE and kind[t] == VALID):
+                    decided[j, i] = True
+    return decided.size - decided.sum()
+
+
+@njit
+def _height_in(points, a, b, c, x, y):
+    """Return the height at a place in a triangle (a < b < c), and how it lies to the triangle."""
+    # Twice the areas of the place with each side, from the lower number to the higher: the same for
+    # both triangles of a side.
+    ab = _area(points, a, b, x, y)
+    bc = _area(points, b, c, x, y)
+    ac = _area(points, a, c, x, y)
+    if not ((ab >= 0 and bc >= 0 and ac <= 0) or (ab <= 0 and bc <= 0 and ac >= 0)):
+        return 0.0, OUTSIDE
+    zeros = (ab == 0) + (bc == 0) + (ac == 0)
+    if zeros == 3:  # no triangle
+        return 0.0, OUTSIDE
+    if zeros == 2:
+        return points[b if ac != 0 else (a if bc != 0 else c), 2], ON_SIDE
+    if zeros == 1:
+        one, two = (a, b) if ab == 0 else ((b, c) if bc == 0 else (a, c))
+        dx, dy = points[two, 0] - points[one, 0], points[two, 1] - points[one, 1]
+        part = (x - points[one, 0]) / dx if abs(dx) >= abs(dy) else (y - points[one, 1]) / dy
+        return points[one, 2] + part * (points[two, 2] - points[one, 2]), ON_SIDE
+    whole = ab + bc - ac
+    rise = -ac * (points[b, 2] - points[a, 2]) + ab * (points[c, 2] - points[a, 2])
+    return points[a, 2] + rise / whole, INSIDE
+
+
+@njit
+def _area(points, one, two, x, y):
+    """Return twice the signed area of two points and a place."""
+    return (points[two, 0] - points[one, 0]) * (y - points[one, 1]) - (
+        points[two, 1] - points[one, 1]
+    ) * (x - points[one, 0])
