@@ -404,7 +404,7 @@ def test_nothing_not_finite_and_nothing_usable():
 
 
 def test_sizes_and_shapes_are_checked():
-    with pytest.raises(OptionError, match="'cell' must be a number above 0"):
+    with pytest.raises(OptionError, match="'cell' must be a number from"):
         filtered_ground([0.0], [0.0], [0.0], cell=0)
     with pytest.raises(OptionError, match="'window' must not be more than 300 cells"):
         filtered_ground([0.0], [0.0], [0.0], cell=0.05)

@@ -32,7 +32,7 @@ from .points import Points
 _FILTER = ("cell", "slope", "window", "threshold", "scalar", "openings")
 
 
-class HagMorphological(FarReaching):
+class HagMorphological(FarReaching, settings=FilterOptions):
     """Measure heights above the ground that a simple morphological filter (SMRF) finds."""
 
     type = "filters.hag_morphological"
@@ -44,42 +44,13 @@ class HagMorphological(FarReaching):
     algorithm_version = 6
     where_help = HEIGHTS_OUTSIDE
     in_models = (*_FILTER, "ignore", "ground", "terrain_slope", "given_ground", "where")
-    cell: float = option("number", 1.0, "Side of the grid's cells", 0.05, 1000, unit="m")
-    slope: float = option(
-        "number",
-        0.1,
-        "Rise over run: a window removes what it lowers by more than this times its radius; raise "
-        "it for rugged terrain without buildings",
-        *(0, 100),
-    )
-    window: float = option(
-        "number",
-        18.0,
-        "Radius of the largest window: half the width of the largest object that is removed; wider "
-        "roofs, up to 220 m, are removed where most of their outline is a step",
-        *(0, 10_000),
-        exclusive=True,
-        unit="m",
-    )
-    threshold: float = option(
-        "number", 0.4, "Maximum distance of ground points from the surface", 0, 1000, unit="m"
-    )
-    scalar: float = option(
-        "number", 1.25, "Added to the threshold per unit of the terrain's slope", 0, 1000
-    )
+    cell: float
+    openings: list[float]
     ignore: Selection = ignore_option("Points that are not ground but still receive heights")
     ground: bool = option(
         "boolean", False, "Also write Ground: 1 where the filter calls the point ground, else 0"
     )
     terrain_slope: bool = option("boolean", False, "Also write Slope: the terrain's, in degrees")
-    openings: list[float] = option(
-        "numbers",
-        (),
-        "Also write heights above morphological openings of the minimum grid with windows of "
-        "these widths in meters, e.g. 5,9,17,33,65: HeightAboveOpening_5, ...",
-        may_be_empty=True,
-    )
-
     given_ground: bool = option(
         "boolean",
         False,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.errors import OptionError
 from ..base.grid import GridWindow
+from ..base.options import Settings, setting
 
 #: Side in meters of the coarsest blocks of the provisional surface, which tells ground points. The
 #: mean error of the ISPRS samples is 0.17 points higher with 8 m (docs/results/ablation.md).
@@ -28,36 +29,53 @@ Keep = Callable[[str, GridWindow, NDArray[np.float32]], None]
 
 
 @dataclass(frozen=True)
-class FilterOptions:
+class FilterOptions(Settings):
     """Options of :func:`.heights.filtered_ground`, in meters; OptionError for wrong ones."""
 
-    cell: float = 1.0  #: side of the grid's cells
-    slope: float = 0.1  #: a window of radius r removes what it lowers by more than this times r
-    #: Radius of the largest window, half the width of the largest object that is removed.
-    window: float = 18.0
-    #: A point is ground within `threshold` plus `scalar` times the terrain's slope of the surface.
-    threshold: float = 0.4
-    scalar: float = 1.25
-    openings: Sequence[float] = ()  #: widths of the openings above which heights are wanted, too
+    cell: float = setting(1.0, "number", "Side of the grid's cells", 0.05, 1000, unit="m")
+    slope: float = setting(
+        0.1,
+        "number",
+        "Rise over run: a window removes what it lowers by more than this times its radius; raise "
+        "it for rugged terrain without buildings",
+        *(0, 100),
+    )
+    window: float = setting(
+        18.0,
+        "number",
+        "Radius of the largest window: half the width of the largest object that is removed; wider "
+        "roofs, up to 220 m, are removed where most of their outline is a step",
+        *(0, 10_000),
+        exclusive=True,
+        unit="m",
+    )
+    threshold: float = setting(
+        0.4, "number", "Maximum distance of ground points from the surface", 0, 1000, unit="m"
+    )
+    scalar: float = setting(
+        1.25, "number", "Added to the threshold per unit of the terrain's slope", 0, 1000
+    )
+    openings: Sequence[float] = setting(
+        (),
+        "numbers",
+        "Also write heights above morphological openings of the minimum grid with windows of "
+        "these widths in meters, e.g. 5,9,17,33,65: HeightAboveOpening_5, ...",
+        may_be_empty=True,
+    )
     slope_too: bool = False  #: whether the terrain's slope is wanted
     keep: Keep | None = None  #: receives what each step made of each piece of the cloud
 
     def __post_init__(self) -> None:
         """Refuse wrong sizes."""
-        for name, value in (
-            ("cell", self.cell),
-            ("window", self.window),
-            *(("openings", size) for size in self.openings),
-        ):
+        super().__post_init__()
+        for name, value in (("window", self.window), *(("openings", w) for w in self.openings)):
             checks.number(f"'{name}'", value, 0, above=True)
-            if name != "cell" and value > _MOST_CELLS * self.cell:
+            if value > _MOST_CELLS * self.cell:
                 raise OptionError(
                     f"'{name}' must not be more than {_MOST_CELLS} cells",
                     found=f"{value:g} m in cells of {self.cell:g} m",
                     cure="Use larger cells or a smaller window",
                 )
-        for name in ("slope", "threshold", "scalar"):
-            checks.number(f"'{name}'", getattr(self, name), 0)
 
     @property
     def radius(self) -> int:
