@@ -28,6 +28,7 @@ import tiling_clouds as clouds
 from pdal_stages import run_tiled
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.threads import available_threads
+from pdal_stages.cli import main
 from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform_task
 from pdal_stages.tiling import dask_workers as dask_cluster
@@ -239,6 +240,52 @@ def test_resume_does_only_what_changed(tmp_path, expected, folder):
 
 
 # ---- people ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("per", ["file", "tile"])
+def test_outputs_that_a_person_edited_are_kept_and_named(tmp_path, folder, capsys, per):
+    """Also where their input changed since; copies are no edits; those of removed inputs are named."""
+    inputs, out = tmp_path / "in", tmp_path / "out"
+    inputs.mkdir()
+    for path in folder.glob("*.laz"):
+        shutil.copy(path, inputs)
+    job = tmp_path / "job.json"
+    job.write_text(json.dumps(pipeline(inputs, out / "o_#.laz")))
+
+    def run(*words):
+        flags = ["--tile", "40", "--workers", "0", "--per", per, "--no-progress", *words]
+        assert main(["pipeline", str(job), *flags]) == 0
+        return capsys.readouterr().err
+
+    run()
+    first, edited = sorted(out.glob("*.laz"))
+    written = {path: path.read_bytes() for path in (first, edited)}
+    las = laspy.read(edited)
+    las.classification[:100] = 6
+    las.write(edited)
+    shutil.copy(first, tmp_path / "copy.laz")  # the same bytes at another time
+    shutil.copy(tmp_path / "copy.laz", first)
+    kept = edited.read_bytes()
+    said = run("--resume")
+    assert f"edited since they were written are kept (--overwrite replaces them): {edited}" in said
+    assert edited.read_bytes() == kept and str(first) not in said
+    for path in inputs.glob("*.laz"):
+        las = laspy.read(path)
+        las.intensity[:] = 7
+        las.write(path)
+    assert str(edited) in run("--resume")
+    assert edited.read_bytes() == kept and set(laspy.read(first).intensity) == {7}
+    assert "edited" not in run("--resume", "--overwrite")
+    assert set(laspy.read(edited).intensity) == {7} and edited.read_bytes() not in (
+        kept,
+        written[edited],
+    )
+    assert "edited" not in run("--resume")
+    (inputs / "east.laz").unlink()
+    gone = out / "o_east.laz" if per == "file" else max(out.glob("*.laz"))
+    assert f"outputs of inputs that are not among those of this run: {gone}" in run("--resume")
+    gone.unlink()
+    assert "output" not in run("--resume")
 
 
 def test_the_workers_stop_too(tmp_path, folder, expected):

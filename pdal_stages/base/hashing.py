@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from typing import Any
 
@@ -14,6 +15,15 @@ import numpy.typing as npt
 _BATCH = 1 << 16
 #: What splitmix64 adds before it mixes.
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def digest_of_file(path: str | os.PathLike) -> str:
+    """Return the SHA-256 digest of a file, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while data := file.read(1 << 24):
+            digest.update(data)
+    return digest.hexdigest()
 
 
 def finalize(h):

@@ -39,6 +39,8 @@ def add_tile_options(command: Parser, survey: bool = False) -> None:
     """Add the flags to the parser of ``pipeline``, or of ``classify`` (a `survey`)."""
     when = "Several inputs and large files are cut into tiles" if survey else "Run in tiles"
     add = add_survey_options(command, when)
+    overwrite = "With --resume: replace outputs that were edited since they were written"
+    add("--overwrite", action="store_true", help=overwrite)
     add("--per", choices=PER, default="file", help="One output per input file or per tile")
     buffer = argparse.SUPPRESS if survey else "How far PDAL's own filters look beyond a tile"
     add("--buffer", type=float, metavar="METERS", help=buffer)

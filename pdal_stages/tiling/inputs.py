@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..base import las, las_check
 from ..base.errors import PipelineError, StageError
-from ..base.hashing import fingerprint
+from ..base.hashing import digest_of_file, fingerprint
 from ..base.units import Units
 from ..pipeline.inputs_outputs import LAS_READERS, locations
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
@@ -68,7 +68,9 @@ class CloudIndex:
         edited.
         """
         try:
-            return os.stat(path).st_ctime_ns == self.changed_ns or digest_of(path) == self.digest
+            return (
+                os.stat(path).st_ctime_ns == self.changed_ns or digest_of_file(path) == self.digest
+            )
         except OSError:
             return False
 
@@ -265,7 +267,7 @@ class Survey:
         A run that is only planned (``--dry-run``) does not read them.
         """
         return {
-            path: digest_of(path) if os.path.isfile(path) else before
+            path: digest_of_file(path) if os.path.isfile(path) else before
             for path, before in self._others.items()
         }
 
@@ -321,15 +323,6 @@ class Survey:
             "inputs": len(self.sources),
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
         }
-
-
-def digest_of(path: str | os.PathLike) -> str:
-    """Return the SHA-256 digest of a file, in hexadecimal digits."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while data := file.read(1 << 24):
-            digest.update(data)
-    return digest.hexdigest()
 
 
 def stamp(path: str | os.PathLike) -> list[int]:

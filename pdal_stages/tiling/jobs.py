@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..base.checks import strict_json
 from ..base.errors import StageError
 from ..base.files import make_own_folder, try_lock, whole_files
+from ..base.hashing import digest_of_file
 from ..base.messages import count_of
 from ..base.version import __version__
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR
@@ -194,6 +195,10 @@ def messages_of(
 FOLDER = ".pdal-stages"
 
 
+#: How the files of arrays end, which tiles leave for outputs.
+_ARRAYS = ".npz"
+
+
 class Store:
     """The working folder of a run in the folder `outputs`, locked while in use."""
 
@@ -250,7 +255,7 @@ class Store:
 
     def path(self, name: str) -> str:
         """Return the path of a file of arrays."""
-        return str(self.kept / f"{name}.npz")
+        return str(self.kept / f"{name}{_ARRAYS}")
 
     def finish(self, name: str, mark: str, record: Mapping[str, Any]) -> None:
         """Save the record of a finished job.
@@ -278,9 +283,29 @@ class Store:
         record = self.note(name)
         with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
             files = record.get("outputs", [])
-            if record.get("fingerprint") == mark and written([path for path, *_ in files]) == files:
+            if record.get("fingerprint") == mark and all(map(_is_as_written, files)):
                 return record
         return None
+
+    def edited(self, name: str) -> list[str]:
+        """Return the outputs of a finished job that were changed since it wrote them."""
+        paths = []
+        for entry in self.note(name).get("outputs", []):
+            with contextlib.suppress(OSError, ValueError, TypeError):
+                if len(entry) == _ENTRY and entry[3] and not _is_as_written(entry):
+                    paths.append(str(entry[0]))
+        return paths
+
+    def left_over(self, outputs: Collection[str]) -> list[str]:
+        """Return the outputs of earlier runs that are still there, but not among `outputs`."""
+        paths: set[str] = set()
+        for note in self.kept.glob("*.json"):
+            with contextlib.suppress(TypeError, AttributeError, IndexError):
+                entries = self.note(note.stem).get("outputs", [])
+                paths.update(
+                    str(entry[0]) for entry in entries if len(entry) == _ENTRY and entry[3]
+                )
+        return sorted(path for path in paths - {*outputs} if os.path.exists(path))
 
     def _note(self, name: str) -> Path:
         return self.kept / f"{name}.json"
@@ -292,9 +317,33 @@ class Store:
                 path.unlink(missing_ok=True)
 
 
+#: Values of a file in a record: its name, size, time, and digest.
+_ENTRY = 4
+
+
 def written(outputs: Sequence[str | os.PathLike]) -> list[list[Any]]:
-    """Return names, sizes and times of files just written, for a record."""
-    return [[str(path), s.st_size, s.st_mtime_ns] for path, s in ((p, os.stat(p)) for p in outputs)]
+    """Return names, sizes, times and digests of files just written, for a record.
+
+    The run's own arrays, which nobody edits, have an empty digest.
+    """
+    entries = []
+    for path in map(str, outputs):
+        status = os.stat(path)
+        digest = "" if path.endswith(_ARRAYS) else digest_of_file(path)
+        entries.append([path, status.st_size, status.st_mtime_ns, digest])
+    return entries
+
+
+def _is_as_written(entry: Sequence[Any]) -> bool:
+    """Return whether a file of a record holds what was written; OSError where it is gone.
+
+    It is read only where its size or time differ, as after it was copied.
+    """
+    path, size, time_ns, digest = entry
+    status = os.stat(path)
+    if [status.st_size, status.st_mtime_ns] == [size, time_ns]:
+        return True
+    return bool(digest) and digest_of_file(path) == digest
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, NDArray]) -> None:

@@ -161,6 +161,8 @@ class TilingOptions:
     #: the free memory
     memory: int | None = None
     resume: bool = False  #: keep what an earlier run finished
+    #: with `resume`: replace outputs that were edited since they were written
+    overwrite: bool = False
     #: most points of a tile that is read again with a wider halo (not tuned)
     most_points: int = 5_000_000
 

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from ..base.files import whole_files
 from ..base.grid import begins_run
+from ..base.hashing import digest_of_file
 from ..pipeline.las_files import laspy_header, read_chunks
 from ..terrain.pieces import refuse_scattered
-from .inputs import CloudIndex, InputSource, digest_of
+from .inputs import CloudIndex, InputSource
 from .options import Box, TileGrid, check_number
 
 if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, for which one piece need not wait
@@ -72,7 +73,7 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     parts = [np.empty((0, 4), np.int64)]
     total = 0
-    changed_ns, digest = os.stat(path).st_ctime_ns, digest_of(path)
+    changed_ns, digest = os.stat(path).st_ctime_ns, digest_of_file(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
         for points in read_chunks(path, most=_PART):
             records = points.array

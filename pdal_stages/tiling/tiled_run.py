@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -174,6 +174,7 @@ class SurveyRun:
     def __init__(self, survey: Survey, store: Store, workers: Any, show: bool | None) -> None:
         self.survey, self.store = survey, store
         self.workers, self.show = workers, show
+        self.edited: list[str] = []  #: outputs that a person changed since an earlier run
         self.cpu_seconds = 0.0  #: of tasks, including failed ones
         self.peak_mb = 0.0  #: peak memory of a process
 
@@ -258,6 +259,9 @@ class SurveyRun:
         for job in waiting:
             if known := self.store.finished(job.name, job.mark):
                 job.state, job.record = "kept", known
+            elif not self.survey.options.overwrite and (paths := self.store.edited(job.name)):
+                job.state, job.record = "kept", self.store.note(job.name)
+                self.edited += paths
         return deque(job for job in waiting if job.state == "waiting")
 
 
@@ -348,6 +352,17 @@ class _Run(SurveyRun):
         """Keep the results of an earlier run; tiles that no output needs are not run again."""
         needed = {job.name for out in self.unkept(self.outputs) for job in out.jobs}
         self.unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
+        outputs = {path for job in (*self.tiles, *self.outputs) for path in job.outputs or ()}
+        self.survey.messages += [
+            *_name_outputs(
+                "outputs edited since they were written are kept (--overwrite replaces them)",
+                self.edited,
+            ),
+            *_name_outputs(
+                "outputs of inputs that are not among those of this run",
+                self.store.left_over(outputs),
+            ),
+        ]
         for job in self.tiles:
             if job.state == "waiting" and job.outputs is None and job.name not in needed:
                 known = self.store.note(job.name)
@@ -525,6 +540,12 @@ def _stop_if_hopeless(reasons: list[str]) -> None:
             f"the first {len(reasons)} tiles all failed for the same reason: the run was stopped",
             found=reasons[0],
         )
+
+
+def _name_outputs(what: str, paths: Sequence[str]) -> list[str]:
+    """Return a message about outputs, if there are any."""
+    more = f" and {len(paths) - 3:,} more" if len(paths) > 3 else ""
+    return [f"{what}: {', '.join(paths[:3])}{more}"] if paths else []
 
 
 def _make_ready(out: Job, waiting: deque[Job]) -> None:
