@@ -134,3 +134,22 @@ def test_train_counts_points_once(folders, tmp_path, run, name):
     assert sum(c["points"] for c in samples[name]) == sum(c["points"] for c in samples["once"])
     count = {"thirds": both}.get(name, points)
     assert f"{count:,} of {points + count:,} points come twice" in said
+
+
+@pytest.mark.pdal
+def test_classify_writes_every_point_and_names_the_pair(folders, tmp_path, run):
+    """Also of a file beside its COPC, which are the same name but for the suffix."""
+    base, points, _ = folders
+    (tmp_path / "in").mkdir()
+    shutil.copy(base / "once" / "a.laz", tmp_path / "in" / "a.laz")
+    shutil.copy(base / "once" / "a.laz", tmp_path / "in" / "a.copc.laz")
+    code, _, said = run(
+        "classify", tmp_path / "in", tmp_path / "out", "--workers", 0, "--no-progress"
+    )
+    assert code == 0, said
+    names = [str(tmp_path / "in" / name) for name in ("a.copc.laz", "a.laz")]
+    assert (
+        f"{names[0]} and {names[1]} have the same number of points within the same bounds" in said
+    )
+    counts = {path.name: len(laspy.read(path)) for path in (tmp_path / "out").glob("*.laz")}
+    assert counts == {"a.laz": points, "a_copc.laz": points}

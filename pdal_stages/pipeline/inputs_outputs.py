@@ -131,6 +131,10 @@ def outputs_of(sources: Sequence[str], target: str, copc: bool = False) -> list[
     path = Path(target)
     names = [Path(source).name for source in sources]
     stems = [n[: -len(".copc.laz")] if named_copc(n) else Path(n).stem for n in names]
+    if not copc:  # town.copc.laz, which QGIS makes beside town.laz, needs a name of its own
+        plain = {stem for n, stem in zip(names, stems, strict=True) if not named_copc(n)}
+        pairs = zip(names, stems, strict=True)
+        stems = [f"{stem}_copc" if named_copc(n) and stem in plain else stem for n, stem in pairs]
     if path.name == "#":
         pairs = zip(names, stems, strict=True)
         names = [f"{stem}.laz" if named_copc(n) and not copc else n for n, stem in pairs]

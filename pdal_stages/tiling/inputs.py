@@ -205,6 +205,7 @@ class Survey:
                 odd += filter(None, [las_check.check_readable(source.path)])
             except StageError as error:
                 source.fault = str(error)
+        self.messages += copies_among(self.sources)
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
         self.messages += [f"{message}{more}" for message in odd[:1]]
 
@@ -323,6 +324,23 @@ class Survey:
             "inputs": len(self.sources),
             "bounds": list(self.bounds) if math.isfinite(self.bounds[0]) else None,
         }
+
+
+def copies_among(sources: Sequence[InputSource]) -> list[str]:
+    """Return a message about the first pair of inputs that seem to hold the same points."""
+    first: dict[tuple, str] = {}
+    pairs = []
+    for source in sources:
+        if source.extent is not None and source.extent.count:
+            key = source.extent.count, *np.round(source.extent.box, 6).tolist()
+            if (other := first.setdefault(key, source.path)) is not source.path:
+                pairs.append(f"{other} and {source.path}")
+    more = f" (and {len(pairs) - 1:,} more pairs)" if len(pairs) > 1 else ""
+    return [
+        f"{pair} have the same number of points within the same bounds{more}: if one is a copy of "
+        "the other, leave it out, as all points are there twice"
+        for pair in pairs[:1]
+    ]
 
 
 def stamp(path: str | os.PathLike) -> list[int]:
