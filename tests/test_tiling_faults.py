@@ -357,11 +357,11 @@ def test_a_straggler_of_an_ended_run_changes_nothing(tmp_path, folder, monkeypat
 
 
 def test_the_command_says_what_is_missing(tmp_path, folder, capsys):
-    from pdal_stages.cli import main
-
     job = tmp_path / "job.json"
-    job.write_text(json.dumps(pipeline(folder, tmp_path / "none" / "o_#.laz")))
-    assert main(["pipeline", str(job), "--tile", "20"]) == 1 and "folder" in capsys.readouterr().err
+    (tmp_path / "file").write_bytes(b"no folder")
+    job.write_text(json.dumps(pipeline(folder, tmp_path / "file" / "none" / "o_#.laz")))
+    assert main(["pipeline", str(job), "--tile", "20"]) == 1
+    assert "the folder of the output cannot be created" in capsys.readouterr().err
     for flag in ("--resume", "--dry-run"):
         assert main(["pipeline", str(job), flag]) == 1
         assert f"{flag} needs --tile" in capsys.readouterr().err
