@@ -200,8 +200,10 @@ def test_octrees_are_called_alike_in_one_piece_and_in_tiles():
     assert outputs_of(["in/a.copc.laz"], "o/#", copc=True) == ["o/a.copc.laz"]
     assert outputs_of(["in/a.copc.laz"], "o/#") == ["o/a.laz"]
     assert outputs_of(["in/a.copc.laz"], "c_#.las", copc=True) == ["c_a.las"]
+    both = ["in/a.copc.laz", "in/a.laz"]
+    assert outputs_of(both, "o/c_#.laz") == ["o/c_a_copc.laz", "o/c_a.laz"]
     with pytest.raises(PipelineError, match="the same name"):
-        outputs_of(["in/a.copc.laz", "in/a.laz"], "o/c_#.laz")
+        outputs_of(["in/a.laz", "other/a.laz"], "o/c_#.laz")
 
 
 def test_copc_or_a_refusal(folder, classify, tmp_path, capsys):
