@@ -15,10 +15,11 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
-from typing import Any, BinaryIO
+from typing import BinaryIO, TypeVar
 
 from .messages import PlainStream
 
+_Result = TypeVar("_Result")
 #: The program of a process; its arguments are where modules are found, not the current folder.
 _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; import pdal_stages.base.processes as own; "
 _PROGRAM += "own.serve()"
@@ -71,7 +72,7 @@ class PythonProcess(AbstractContextManager):
             with suppress(OSError):  # a call that it has not read
                 pipe.close()  # type: ignore[union-attr]
 
-    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+    def call(self, function: Callable[..., _Result], *arguments: object) -> _Result:
         """Call a function there that it can import; return its result or raise its error."""
         calls, results = self._process.stdin, self._process.stdout
         assert calls is not None and results is not None

@@ -15,9 +15,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from . import checks
+
+_Block = TypeVar("_Block")
+_Result = TypeVar("_Result")
 
 #: Files of a control group, of version 2 and of version 1, with its quota of CPU and the period of
 #: that quota, both in microseconds.
@@ -59,11 +62,11 @@ def resolve_threads(threads: int | None) -> int:
 
 
 def map_blocks(
-    function: Callable[[Any], Any],
-    blocks: Sequence[Any],
+    function: Callable[[_Block], _Result],
+    blocks: Sequence[_Block],
     threads: int | None = None,
     ahead: int = 2,
-) -> Iterator[Any]:
+) -> Iterator[_Result]:
     """Yield ``function(block)`` for every block, in order, computed by several `threads`.
 
     The function should release the GIL. At most ``threads * ahead`` results wait unread, so memory
@@ -75,7 +78,7 @@ def map_blocks(
         yield from map(function, blocks)
         return
     pool = ThreadPoolExecutor(count, thread_name_prefix="pdal-stages")
-    pending: deque[Future] = deque()
+    pending: deque[Future[_Result]] = deque()
     try:
         for block in blocks:
             pending.append(pool.submit(function, block))

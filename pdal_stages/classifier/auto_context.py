@@ -187,7 +187,7 @@ class PassRun:
         threads = self._request.threads
         if features in held:
             for kept, result in map_blocks(work.classify, held[features], threads):
-                if len(kept):
+                if result is not None:
                     yield kept, result
         elif features is not None and len(rows):
             held[features] = []

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.engine import FeatureBlock, Run
 from .context_features import OWN, Context
@@ -99,7 +100,7 @@ class CloudFeatures:
         )
 
     def blocks(
-        self, rows: npt.NDArray[np.int64] | None, progress: Any = None
+        self, rows: npt.NDArray[np.int64] | None, progress: Progress | None = None
     ) -> Iterator[FeatureBlock]:
         """Yield the computed blocks of some rows (None: all)."""
         run = self.run(rows)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.messages import Report
+from ..base.progress import Progress
 
 if TYPE_CHECKING:  # they take long to import
     from ..features.plan import FeaturePlan
@@ -57,7 +58,7 @@ class PredictRequest:
     rows: npt.NDArray[np.int64] | None = None
     threads: int | None = None
     memory_mb: float = 256.0  #: for work under way
-    progress: Any = None  #: its ``update`` is called with the points done
+    progress: Progress | None = None  #: is told of the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
     device: str = "cpu"  #: where a network is applied
     #: what is counted, complete when all blocks are read

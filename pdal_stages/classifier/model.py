@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.messages import Report
+from ..base.progress import Progress
 from ..features import FeaturePlan
 from ..features.cell_means import density
 from ..features.point_grid import check_xyz
@@ -199,7 +200,7 @@ class Model:
         current: npt.ArrayLike | None = None,
         ignore: npt.ArrayLike | None = None,
         may_be_ground: npt.ArrayLike | None = None,
-        progress: Any = None,
+        progress: Progress | None = None,
         **options: Any,
     ) -> Prediction:
         """Classify a cloud, block by block.
@@ -222,8 +223,8 @@ class Model:
         may_be_ground : (n,) bool, optional
             Points that may become class 2. Others for which it wins get the second class, with
             its probability as reliability and a margin of 0.
-        progress : object, optional
-            Its ``update`` is called with the number of points done.
+        progress : Progress, optional
+            Is told the number of points done.
         **options
             See :class:`PredictionOptions`.
         """
@@ -275,7 +276,7 @@ class Model:
         work: WorkingCloud,
         dimensions: Mapping[str, npt.ArrayLike],
         how: PredictionOptions,
-        progress: Any,
+        progress: Progress | None,
     ) -> PredictRequest:
         """Return the request for the points in work."""
         names = (*self.required_dimensions, *self.optional_dimensions)
@@ -295,7 +296,7 @@ class Model:
         work: WorkingCloud,
         request: PredictRequest,
         columns: dict[str, npt.NDArray[Any]],
-        progress: Any,
+        progress: Progress | None,
     ) -> None:
         """Fill the columns (n, ...) of all points of the cloud, block by block.
 

@@ -18,7 +18,13 @@ from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from .plan import DEFAULT_FEATURES, DEFAULT_NEIGHBORHOODS, FeaturePlan
 from .point_grid import CellGrid, build_grid, check_xyz
-from .shape_distributions import SAMPLES, Fitted, ShapeBins, smallest_hashes
+from .shape_distributions import (
+    SAMPLES,
+    Fitted,
+    NeighborhoodGroup,
+    ShapeBins,
+    smallest_hashes,
+)
 
 #: Rows of a block, whatever the memory allows: large enough that a block's calls cost little, small
 #: enough that Ctrl-C, which waits for the blocks in work, comes at once. Not tuned.
@@ -116,7 +122,7 @@ class FeatureEngine:
         self.cloud = check_xyz(xyz)
         self.grid = build_grid(self.cloud, plan.cell) if grid is None else grid
         self._lock = threading.RLock()
-        self._groups: list[Any] = []
+        self._groups: list[NeighborhoodGroup] = []
         self.report = Report({"points": len(self.grid.order), "queries": 0, "fewer_than_three": {}})
 
     def __len__(self) -> int:
@@ -150,7 +156,11 @@ class FeatureEngine:
         The plan must have an adaptive neighborhood.
         """
         out = np.empty(len(self))
-        out[self.grid.order] = self.neighborhoods()[1].curvatures(self.threads)
+        from .adaptive import AdaptiveNeighborhoods
+
+        groups = self.neighborhoods()
+        (adaptive,) = (group for group in groups if isinstance(group, AdaptiveNeighborhoods))
+        out[self.grid.order] = adaptive.curvatures(self.threads)
         return out
 
     def shape_values(self, rows: np.ndarray, threshold: float | None) -> dict[str, np.ndarray]:
@@ -165,7 +175,7 @@ class FeatureEngine:
         shaped = (c.neighborhood.token for c in self.plan.layout if c.shapes)
         return {token: values[token] for token in shaped}
 
-    def neighborhoods(self) -> list[Any]:
+    def neighborhoods(self) -> list[NeighborhoodGroup]:
         """Return the plan's neighborhoods, prepared for the cloud once: fixed, then adaptive."""
         with self._lock:
             if not self._groups:

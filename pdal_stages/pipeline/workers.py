@@ -13,7 +13,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from ..base import checks
 from ..base.errors import InterruptedStage, StageError
@@ -29,6 +29,12 @@ KILLED = str(ProcessEnded())
 _one_task = threading.Lock()
 
 
+#: What a worker calls; its result is :attr:`TaskResult.result`.
+Task = Callable[[], Any]
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
 @dataclass
 class TaskResult:
     """The result of a task."""
@@ -39,7 +45,7 @@ class TaskResult:
     cost: dict[str, float] = field(default_factory=dict)
 
 
-def perform_task(task: Callable[[], Any]) -> TaskResult:
+def perform_task(task: Task) -> TaskResult:
     """Call a task; errors are part of the result, except Ctrl-C."""
     with _one_task:
         started, cpu = time.perf_counter(), time.process_time()
@@ -64,7 +70,7 @@ class Workers(Protocol):
     slots: int  #: tasks at the same time
     threads: int  #: threads of each task
 
-    def submit(self, task: Callable[[], Any]) -> Any:
+    def submit(self, task: Task) -> Any:
         """Send a task to a free worker; return what stands for its result."""
 
     def wait(self, futures: Iterable[Any]) -> set[Any]:
@@ -103,7 +109,7 @@ class ThisProcess(AbstractContextManager):
     def __exit__(self, *exc: object) -> None:
         """Leave the process as it is."""
 
-    def submit(self, task: Callable[[], Any]) -> Future:
+    def submit(self, task: Task) -> Future:
         """Do a task at once."""
         future: Future = Future()
         with deferred_interrupts():
@@ -136,7 +142,7 @@ class WorkerProcesses(AbstractContextManager):
             process.kill()
         self._waiting.shutdown(cancel_futures=True)
 
-    def submit(self, task: Callable[[], Any]) -> Future:
+    def submit(self, task: Task) -> Future:
         """Send a task to a free worker."""
         try:
             process = self._idle.pop() if self._idle else PythonProcess(self._environment)
@@ -160,14 +166,14 @@ class WorkerProcesses(AbstractContextManager):
 
 
 def run_tasks(
-    workers: Workers, waiting: deque, task_of: Callable[[Any], Callable[[], Any]]
-) -> Iterator[tuple[Any, TaskResult]]:
+    workers: Workers, waiting: deque[_Item], task_of: Callable[[_Item], Task]
+) -> Iterator[tuple[_Item, TaskResult]]:
     """Yield (item, result) for every waiting item, as they finish.
 
     Items may be added after every result. `task_of` is called for an item's task just before it is
     sent.
     """
-    running: dict[Any, Any] = {}
+    running: dict[Any, _Item] = {}
     while waiting or running:
         while waiting and len(running) < workers.slots:
             item = waiting.popleft()
@@ -187,8 +193,8 @@ def _result_of(future: Any) -> TaskResult:
 
 
 def each_file(
-    function: Callable[..., Any], work: Sequence[tuple], workers: int = 1
-) -> Iterator[Any]:
+    function: Callable[..., _Result], work: Sequence[tuple], workers: int = 1
+) -> Iterator[_Result]:
     """Yield the result for each item of work, the function's arguments, as they finish.
 
     The function must be importable by other processes. They share the cores. A single worker is
