@@ -148,7 +148,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
             raise OptionError(
                 "option 'vegetation_heights' is for models that know vegetation as one class, 5",
                 found=f"classes {', '.join(map(str, codes))}",
-                cure="Leave it out, or train with --classes that join vegetation: \"3,4,5\": 5",
+                cure='Leave it out, or train with --classes that join vegetation: "3,4,5": 5',
             )
 
     @cached_property
