@@ -91,6 +91,16 @@ def test_code_is_kept_only_where_no_other_user_can_put_any(tmp_path):
         assert not count and f"other users can write to {home}" in errors
 
 
+def test_code_that_was_not_loaded_for_long_is_removed(tmp_path):
+    old, recent = (tmp_path / "kernels" / "kernels" / name for name in ("0123", "4567"))
+    for folder in (old, recent):
+        folder.mkdir(parents=True)
+    os.utime(old, (0, 0))
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    subprocess.run([sys.executable, "-c", TWO_KERNELS], env=env, check=True, capture_output=True)
+    assert recent.is_dir() and not old.exists()
+
+
 @pytest.mark.pdal
 def test_after_warmup_a_job_compiles_nothing(ready_town, tmp_path):
     pytest.importorskip("pyogrio")
