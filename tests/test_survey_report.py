@@ -161,6 +161,16 @@ def test_the_same_in_tiles_and_files(result, cloud, control, tmp_path):
         assert cut[name] == result[name], name
 
 
+def test_points_that_come_twice_count_once(result, cloud, control, tmp_path):
+    copy = tmp_path / "copy.laz"
+    copy.write_bytes(cloud.read_bytes())
+    more = {"density": 3.0, "control": str(control), "progress": False}
+    twice = write_report([str(cloud), str(copy)], str(tmp_path / "r.html"), **more)
+    assert twice["repeated"] == result["survey"]["points"] and result["repeated"] == 0
+    for name in ("area_m2", "density", "voids", "strips", "control"):
+        assert twice[name] == result[name], name
+
+
 def test_the_page(result, cloud):
     page = cloud.with_name("report.html").read_text()
     assert page.count("<img") == 5 and "<script" not in page and "Signature" in page

@@ -2,37 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError, optional_import
 from ..base.files import whole_files
+from ..base.geotiff import rasterio
 from ..base.grid import GridWindow
 from ..base.version import __version__
 from ..pipeline.spatial_reference import Reference
 
 #: The value of cells without one.
 NODATA = -9999.0
-#: Side of a block of a file, in cells.
-_BLOCK = 512
 #: Megabytes of blocks that GDAL holds.
 _CACHE = 256
 #: How rasters name units of height, by meters.
 _UNIT_NAMES = {1.0: "metre", 0.3048: "foot", 1200.0 / 3937.0: "US survey foot"}
-
-
-def raster(name: str = "rasterio") -> Any:
-    """Import rasterio or a module of it, or raise DependencyError with the way to install it."""
-    return optional_import(name, "raster", "write rasters")
+#: Blocks of 512 cells; those without values take no room. Larger files than 4 GB get another form.
+_PLAIN = {
+    "driver": "GTiff", "dtype": "float32", "count": 1, "nodata": NODATA, "bigtiff": "IF_SAFER",
+    "tiled": True, "blockxsize": 512, "blockysize": 512, "sparse_ok": True,
+}  # fmt: skip
+_CLOUD_OPTIMIZED = {
+    "driver": "COG", "compress": "DEFLATE", "predictor": "YES", "blocksize": 512,
+    "overview_resampling": "AVERAGE", "bigtiff": "IF_SAFER",
+}  # fmt: skip
 
 
 def write_rasters(
     paths: Mapping[str, Path],
-    parts: Any,
+    parts: Callable[[str], Iterable[tuple[GridWindow, NDArray]]],
     window: GridWindow,
     resolution: float,
     reference: Reference,
@@ -54,69 +56,34 @@ def write_rasters(
     texts : mapping
         What each raster holds.
     """
-    rasterio, shutil = raster(), raster("rasterio.shutil")
+    library, copier = rasterio(), optional_import("rasterio.shutil", "raster", "writing rasters")
+    north = window.bottom + window.height
+    corner = window.left * resolution, north * resolution
     profile = {
-        "driver": "GTiff",
-        "dtype": "float32",
-        "count": 1,
-        "width": window.width,
-        "height": window.height,
-        "nodata": NODATA,
-        "crs": rasterio.crs.CRS.from_wkt(reference.wkt) if reference.wkt else None,
-        "transform": rasterio.transform.from_origin(
-            window.left * resolution,
-            (window.bottom + window.height) * resolution,
-            resolution,
-            resolution,
-        ),
-        "tiled": True,
-        "blockxsize": _BLOCK,
-        "blockysize": _BLOCK,
-        "sparse_ok": True,
-        "bigtiff": "IF_SAFER",
-    }
-    how = {
-        "driver": "COG",
-        "compress": "DEFLATE",
-        "predictor": "YES",
-        "blocksize": _BLOCK,
-        "overview_resampling": "AVERAGE",
-        "bigtiff": "IF_SAFER",
-    }
-    with (
-        whole_files(*paths.values(), what="raster") as partials,
-        rasterio.Env(GDAL_CACHEMAX=_CACHE),
-    ):
+        **_PLAIN, "width": window.width, "height": window.height,
+        "crs": library.crs.CRS.from_wkt(reference.wkt) if reference.wkt else None,
+        "transform": library.transform.from_origin(*corner, resolution, resolution),
+    }  # fmt: skip
+    unit = reference.units.vertical
+    names = (name for meters, name in _UNIT_NAMES.items() if abs(meters - unit) < 1e-9)
+    unit_name = next(names, f"{unit:g} m")
+    whole = whole_files(*paths.values(), what="raster")
+    with whole as partials, library.Env(GDAL_CACHEMAX=_CACHE):
         for name, partial in zip(paths, partials, strict=True):
             plain = partial.with_suffix(".plain.tif")
             try:
-                with rasterio.open(plain, "w", **profile) as out:
-                    out.units = (_unit_name(reference.units.vertical),)
-                    out.descriptions = (texts[name],)
+                with library.open(plain, "w", **profile) as out:
+                    out.units, out.descriptions = (unit_name,), (texts[name],)
                     out.update_tags(TIFFTAG_SOFTWARE=f"pdal_stages {__version__}")
-                    for place, values in _clipped(parts(name), window):
-                        out.write(np.where(np.isnan(values), NODATA, values), 1, window=place)
-                shutil.copy(plain, partial, **how)
-            except rasterio.errors.RasterioError as error:
+                    for part, values in parts(name):
+                        both = part.intersect(window)
+                        if both.width and both.height:
+                            left, top = both.left - window.left, north - both.bottom - both.height
+                            place = library.windows.Window(left, top, both.width, both.height)
+                            cells = values[both.slices_in(part)][::-1]
+                            out.write(np.where(np.isnan(cells), NODATA, cells), 1, window=place)
+                copier.copy(plain, partial, **_CLOUD_OPTIMIZED)
+            except library.errors.RasterioError as error:
                 what = "the raster could not be written"
                 raise StageError(what, found=f"{paths[name]}: {error}") from error
             plain.unlink()
-
-
-def _clipped(
-    parts: Iterator[tuple[GridWindow, NDArray]], window: GridWindow
-) -> Iterator[tuple[Any, NDArray]]:
-    """Yield the parts of a raster in a window, from the north, with their place in the file."""
-    make_window = raster("rasterio.windows").Window
-    for part, values in parts:
-        both = part.intersect(window)
-        if both.width and both.height:
-            top = window.bottom + window.height - both.bottom - both.height
-            place = make_window(both.left - window.left, top, both.width, both.height)
-            yield place, values[both.slices_in(part)][::-1]
-
-
-def _unit_name(meters: float) -> str:
-    """Return the name of a unit of height."""
-    near = (name for value, name in _UNIT_NAMES.items() if abs(value - meters) < 1e-9)
-    return next(near, f"{meters:g} m")

@@ -13,19 +13,15 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError, optional_import
 from ..base.files import Output, check_outputs
+from ..base.geotiff import rasterio
 from ..base.grid import GridWindow
-from ..base.hashing import fingerprint
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.inputs import Survey
-from ..tiling.jobs import Job, load_arrays
 from ..tiling.options import Density, TilingOptions
-from ..tiling.tile_records import RecordRun, earlier_layout, plan_of_records, record_run
+from ..tiling.tile_records import RecordRun, Tile, earlier_layout, plan_of_records, record_run
 from .cells import STEPS, CellDensity, SurfaceOptions, reduce_points
-from .geotiff import raster, write_rasters
+from .geotiff import write_rasters
 from .rasters import RASTERS, TileCells, compute_tile
-
-#: What the arrays of tiles are named after: of cells, and of rasters.
-_CELLS, _RASTERS = "cells", "rasters"
 
 
 class CellSurvey(Survey):
@@ -80,13 +76,11 @@ def write_surfaces(
     StageError
         Where no point is ground, references differ, or a file cannot be read or written.
     """
-    raster()  # before any work
+    rasterio()  # before any work
     optional_import("startinpy", "raster", "a terrain model")
     files = input_files(inputs)
     place = Path(folder)
     paths = {name: place / f"{name}.tif" for name in RASTERS}
-    if place.is_dir():
-        check_outputs([Output(str(path), "raster") for path in paths.values()], files)
     options, chosen = options or SurfaceOptions(), replace(tiling or TilingOptions(), per="tile")
     survey = CellSurvey(files, place, chosen, options)
     place.mkdir(parents=True, exist_ok=True)
@@ -99,7 +93,7 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> dic
     """Compute all tiles, and write the rasters."""
     survey = run.survey
     reduce = partial(reduce_points, options=options, unit=survey.unit)
-    reduced = run.reduce(_CELLS, asdict(options), reduce)
+    reduced = run.reduce("cells", asdict(options), reduce)
     if not any(job.record["ground"] for job in reduced):
         raise StageError(
             "no point is ground (classes 2, 9, 11), so there is no terrain",
@@ -109,37 +103,22 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> dic
     window = enclose(GridWindow(*job.record["window"]) for job in reduced)
     size = options.resolution
     x0, y0, wide, tall = (number * size for number in window)
-    box = x0, y0, x0 + wide, y0 + tall
-    files = {job.tile: run.path_of(job) for job in reduced}
-    in_steps = tuple(side * STEPS for side in box)
-    cells = TileCells(options, survey.grid, survey.unit, in_steps, files)  # type: ignore[arg-type]
-    marks = {job.tile: job.mark for job in reduced}
-    points = {job.tile: job.points for job in reduced}
+    in_steps = x0 * STEPS, y0 * STEPS, (x0 + wide) * STEPS, (y0 + tall) * STEPS
+    cells = TileCells(options, survey.grid, survey.unit, in_steps, {})
     centers = x0 + size / 2, y0 + size / 2, x0 + wide - size / 2, y0 + tall - size / 2
-    near = {tile: cells.near(tile, cells.reach) for tile in survey.grid.covering(centers)}
-    jobs = [
-        Job(
-            f"{survey.grid.name(tile)}.{_RASTERS}",
-            points.get(tile, 1),
-            tile,
-            mark=fingerprint(window, [marks[other] for other in around.files]),
-        )
-        for tile, around in near.items()
-        if around.files
-    ]
 
-    def task_of(job: Job) -> Callable[[], Any]:
-        return partial(compute_tile, near[job.tile], job.tile, run.path_of(job))
+    def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Any]:
+        return partial(compute_tile, replace(cells, files=files), tile, target)
 
-    run.compute("surfaces", jobs, task_of)
+    tiles = survey.grid.covering(centers)
+    jobs = run.compute("rasters", reduced, tiles, cells.reach + size, compute)
 
     def parts(name: str) -> Iterator[tuple[GridWindow, NDArray]]:
         for job in jobs:
-            arrays = load_arrays(run.path_of(job), (name, "window"))
+            (arrays,) = run.arrays([job], name, "window")
             yield GridWindow(*arrays["window"].tolist()), arrays[name]
 
     write_rasters(paths, parts, window, size, survey.reference, RASTERS)
-    run.forget((_CELLS, _RASTERS))
     known = {name: sum(job.record[name] for job in jobs) for name in RASTERS}
     shown = {name: str(path) for name, path in paths.items()}
     return {"files": shown, "width": window.width, "height": window.height, "known": known}

@@ -15,6 +15,7 @@ from ..base.errors import optional_import
 from ..base.grid import GridWindow
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.options import Box, TileGrid, touching
+from ..tiling.tile_records import Tile, cells_in_tile
 from .cells import EMPTY, STEPS, Integers, SurfaceOptions, lowest
 from .triangulation import heights_at
 
@@ -35,32 +36,12 @@ class TileCells:
     grid: TileGrid
     unit: float  #: meters per unit of the coordinates
     bounds: Box  #: of all points, in steps
-    files: Mapping[tuple[int, int], str]  #: the arrays of each tile with points
+    files: Mapping[Tile, str]  #: the arrays of the tiles around one
 
     @property
     def reach(self) -> float:
         """Return how far around a tile ground points matter, in the unit of the coordinates."""
         return 2 * self.options.max_radius / self.unit
-
-    def own_cells(self, tile: tuple[int, int]) -> GridWindow:
-        """Return the cells whose centers lie in a tile."""
-        sides = []
-        for number, low in zip(tile, self.grid.box(tile)[:2], strict=True):
-            first = math.floor(low / self.options.resolution) - 1
-            count = math.ceil(self.grid.size / self.options.resolution) + 3
-            cells = first + np.arange(count, dtype=float)
-            sides.append(cells[self.grid.index((cells + 0.5) * self.options.resolution) == number])
-        if not all(map(len, sides)):
-            return GridWindow(0, 0, 0, 0)
-        return GridWindow.enclosing(*(side.astype(np.int64) for side in sides))
-
-    def near(self, tile: tuple[int, int], reach: float) -> TileCells:
-        """Return these cells with the files near a tile alone."""
-        width = math.ceil((reach + self.options.resolution) / self.grid.size)
-        around = range(-width, width + 1)
-        places = [(tile[0] + i, tile[1] + j) for j in around for i in around]
-        files = {place: self.files[place] for place in places if place in self.files}
-        return TileCells(self.options, self.grid, self.unit, self.bounds, files)
 
     def load(self, box: Box, names: tuple[str, ...]) -> list[dict[str, NDArray]]:
         """Return some arrays of the tiles that share a point with a box, in steps."""
@@ -95,13 +76,14 @@ class TileCells:
         return out[0], out[1]
 
 
-def compute_tile(cells: TileCells, tile: tuple[int, int], target: str) -> dict[str, Any]:
+def compute_tile(cells: TileCells, tile: Tile, target: str) -> dict[str, Any]:
     """Compute the rasters of a tile, save them, and return how many cells of each are known.
 
     The arrays are named as in :data:`RASTERS`, (rows, columns) float32 from the south with NaN for
     no height; ``window`` tells which cells they are.
     """
-    options, window = cells.options, cells.own_cells(tile)
+    options = cells.options
+    window = cells_in_tile(cells.grid, tile, options.resolution)
     arrays = {name: np.empty((0, 0)) for name in RASTERS}
     if window.width and window.height:
         terrain = _terrain(cells, window)

@@ -14,17 +14,8 @@ from scipy import ndimage
 
 from ..base.grid import GridWindow
 from ..base.messages import count_of
+from ..reports import pictures
 from ..reports.accuracy_page import render_page
-from ..reports.pictures import (
-    CLASS_COLORS,
-    HEIGHT_COLORS,
-    Surface,
-    embed,
-    nice_step,
-    paint,
-    ramp,
-    shading,
-)
 from .cells import EMPTY, STEPS
 from .survey_cells import ReportRules
 
@@ -61,30 +52,27 @@ def render_report(result: Mapping[str, Any], rasters: Rasters) -> str:
     away, at = ndimage.distance_transform_edt(top == EMPTY, return_indices=True)
     known, top = away < _GAP, top[tuple(at)]
     z = np.where(known, (top >> 8) / STEPS, np.nan) * rasters.rules.vertical
-    relief = Surface(0.0, 0.0, side * rasters.unit, np.where(known, 0, -1)[::-1], z[::-1], 1.0)
-    light, codes = shading(relief), np.where(known, top & 255, 0)[::-1]
+    relief = pictures.Surface(
+        0.0, 0.0, side * rasters.unit, np.where(known, 0, -1)[::-1], z[::-1], 1.0
+    )
+    light, codes = pictures.shading(relief), np.where(known, top & 255, 0)[::-1]
     per_m2 = rasters.of["all"][1] / (rasters.rules.density * rasters.unit) ** 2
     most = result["density"]["ordered"] or float(np.percentile(per_m2[per_m2 > 0], 90))
-    density = ramp(np.where(per_m2 > 0, per_m2, np.nan), _DENSITY, (0.0, 2 * most))
+    density = pictures.ramp(np.where(per_m2 > 0, per_m2, np.nan), _DENSITY, (0.0, 2 * most))
     held = np.where(rasters.of["void"][1] > 0, 235, 255)[..., None].repeat(3, axis=2)
     held[rasters.voids > 0] = _VOID
     meters = rasters.rules.density * rasters.unit
+    each = f"Points a m2, cells of {meters:g} m: white 0, dark {2 * most:.3g}"
+    heights, colors = pictures.ramp(relief.z, pictures.HEIGHT_COLORS), pictures.CLASS_COLORS[codes]
     views = [
-        _view("Classes", paint(relief, CLASS_COLORS[codes], light), relief.pixel),
-        _view("Heights", paint(relief, ramp(relief.z, HEIGHT_COLORS), light), relief.pixel),
-        _view(
-            f"Points a m2, cells of {meters:g} m: white 0, dark {2 * most:.3g}",
-            density[::-1],
-            meters,
-        ),
+        _view("Classes", pictures.paint(relief, colors, light), relief.pixel),
+        _view("Heights", pictures.paint(relief, heights, light), relief.pixel),
+        _view(each, density[::-1], meters),
         _view("Voids: red", held[::-1].astype(np.uint8), rasters.rules.void * rasters.unit),
     ]
     if len(rasters.strips):
-        views.append(
-            _view(
-                f"Strips: RMS difference, blue 0, red {_LARGE:g} m", _strips(rasters)[::-1], meters
-            )
-        )
+        heading = f"Strips: RMS difference, blue 0, red {_LARGE:g} m"
+        views.append(_view(heading, _strips(rasters)[::-1], meters))
     every = [(Path(path).name, described) for path, described in result["files"].items()]
     return render_page(
         "survey.html",
@@ -106,7 +94,7 @@ def _strips(rasters: Rasters) -> NDArray[np.uint8]:
     total, cells = (np.bincount(index, v, shape).reshape(points.shape) for v in (squares, count))
     scale = rasters.unit * rasters.rules.vertical / STEPS
     with np.errstate(invalid="ignore"):
-        return ramp(np.sqrt(total / cells) * scale, _DIFFERENCES, (0.0, _LARGE))
+        return pictures.ramp(np.sqrt(total / cells) * scale, _DIFFERENCES, (0.0, _LARGE))
 
 
 def _view(heading: str, colors: NDArray[np.uint8], pixel_m: float) -> dict[str, Any]:
@@ -114,13 +102,9 @@ def _view(heading: str, colors: NDArray[np.uint8], pixel_m: float) -> dict[str, 
     times = max(1, _LEAST // colors.shape[1])
     colors = colors.repeat(times, axis=0).repeat(times, axis=1)
     wide = colors.shape[1] * pixel_m / times
-    length = nice_step(wide / _SCALE_PART)
-    return {
-        "heading": heading,
-        "alt": heading,
-        "scale": (100 * length / wide, f"{length:g} m"),
-        **embed(colors),
-    }
+    length = pictures.nice_step(wide / _SCALE_PART)
+    scale = 100 * length / wide, f"{length:g} m"
+    return {"heading": heading, "alt": heading, "scale": scale, **pictures.embed(colors)}
 
 
 def _time_span(times: tuple[float, float] | None) -> str:

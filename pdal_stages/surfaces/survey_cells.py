@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -13,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE, OVERLAP, TERRAIN, WATER
+from ..base.distinct import DistinctPoints
 from ..base.grid import GridWindow, cell_numbers
 from ..tiling.jobs import load_arrays, save_arrays
 from .cells import EMPTY, STEPS, Integers, steps
+
+#: Of points without times: a first time that is later than all.
+NEVER = 1e300
 
 
 @dataclass(frozen=True)
@@ -37,54 +41,45 @@ class ReportRules:
 
 
 def describe(part: Any) -> dict[str, Any]:
-    """Return counts, extent and times of points (a laspy record) as JSON types."""
-    codes = np.asarray(part.classification)
-    names = set(part.point_format.dimension_names)
-    flagged = np.asarray(part.overlap, bool) if "overlap" in names else codes == OVERLAP
-    times = np.asarray(part.gps_time) if "gps_time" in names else np.zeros(0)
-    known = times[np.isfinite(times) & (times != 0)]
+    """Return counts, and extents of x, y, z and times, of points (a laspy record) as JSON types."""
+    codes, names = np.asarray(part.classification), set(part.point_format.dimension_names)
+    overlap = np.asarray(part.overlap, bool) if "overlap" in names else codes == OVERLAP
+    times = _times(part)
+    flags = {"last_returns": _is_last(part), "withheld": part.withheld, "overlap": overlap}
+    counts = {"points": len(codes)} | {name: int(np.sum(flag)) for name, flag in flags.items()}
     counted = {"classes": codes, "returns": part.return_number, "sources": part.point_source_id}
-    extent = [[float(np.min(part[name])), float(np.max(part[name]))] for name in "xyz"]
-    return {
-        "points": len(codes),
-        "last_returns": int(_is_last(part).sum()),
-        "withheld": int(np.asarray(part.withheld, bool).sum()),
-        "overlap": int(flagged.sum()),
-        **{name: _count(np.asarray(values)) for name, values in counted.items()},
-        "extent": extent,
-        "times": [float(known.min()), float(known.max())] if len(known) else None,
-    }
+    for name, values in counted.items():
+        unique, count = np.unique(np.asarray(values), return_counts=True)
+        counts |= {f"{name} {v}": n for v, n in zip(unique.tolist(), count.tolist(), strict=True)}
+    axes = [*(np.asarray(part[name]) for name in "xyz"), times[np.isfinite(times) & (times != 0)]]
+    extent = [[float(v.min(initial=NEVER)), float(v.max(initial=-NEVER))] for v in axes]
+    return {"counts": counts, "extent": extent}
 
 
-def combine(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def combine(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the description of several parts (:func:`describe`) together."""
-    first, *others = parts
-    out = dict(first)
-    for part in others:
-        for name, value in part.items():
-            if isinstance(value, dict):
-                out[name] = dict(Counter(out[name]) + Counter(value))
-            elif isinstance(value, int):
-                out[name] += value
-            elif name == "extent":
-                both = zip(out[name], value, strict=True)
-                out[name] = [[min(a[0], b[0]), max(a[1], b[1])] for a, b in both]
-            elif value is not None:
-                a = out[name] or value
-                out[name] = [min(a[0], value[0]), max(a[1], value[1])]
-    return {
-        name: dict(sorted(value.items(), key=lambda item: int(item[0])))
-        if isinstance(value, dict)
-        else value
-        for name, value in out.items()
-    }
+    low, high = (pick([part["extent"] for part in parts], axis=0) for pick in (np.min, np.max))
+    extent = np.column_stack([low[:, 0], high[:, 1]]).tolist()
+    counts: Counter[str] = Counter()
+    for part in parts:
+        counts.update(part["counts"])
+    return {"counts": counts, "extent": extent}
 
 
-def _count(values: NDArray) -> dict[str, int]:
-    """Return how often each value occurs."""
-    return {
-        str(value): int(n) for value, n in zip(*np.unique(values, return_counts=True), strict=True)
-    }
+def figures_of(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a description as it is reported: counts by class, return and source, in order."""
+    out: dict[str, Any] = {"classes": {}, "returns": {}, "sources": {}}
+    for key, count in sorted(part["counts"].items(), key=lambda item: (len(item[0]), item[0])):
+        name, _, value = key.partition(" ")
+        out |= {name: {**out[name], value: count} if value else count}
+    *out["extent"], times = part["extent"]
+    return {**out, "times": times if times[0] < NEVER else None}
+
+
+def _times(part: Any) -> NDArray[np.float64]:
+    """Return the GPS times of points (n,), 0 where they are not known."""
+    known = "gps_time" in part.point_format.dimension_names
+    return np.asarray(part.gps_time) if known else np.zeros(len(part))
 
 
 def _is_last(part: Any) -> NDArray[np.bool_]:
@@ -105,19 +100,22 @@ def reduce_for_report(
         else 1; ``picture`` is 256 x height in steps + class of the highest point. ``strips``
         (k, 5) int64: source, column, row, sum of heights in steps, and number of ground points.
         ``control`` (m, 3) int64: ground points near control points (c, 2), in steps.
-        Noise and withheld points are left out.
+        Noise, withheld points and those that come twice are left out.
     figures : dict
-        ``files``: see :func:`describe`.
+        ``files``: see :func:`describe`; ``repeated``: points that come twice.
     """
-    columns = []
+    columns, distinct = [], DistinctPoints()
     for _, part in parts:
         codes = np.asarray(part.classification)
         kept = ~np.isin(codes, NOISE) & ~np.asarray(part.withheld, bool)
+        where = {axis.upper(): np.asarray(part[axis]) for axis in "xyz"}
+        kept &= distinct.first({**where, "GpsTime": _times(part)})
         xyz = [steps(np.asarray(part[name])) for name in "xyz"]
         more = codes, _is_last(part), np.asarray(part.point_source_id)
         columns.append(np.column_stack([*xyz, *(np.asarray(v, np.int64) for v in more)])[kept])
     points = np.concatenate([np.empty((0, 6), np.int64), *columns])
-    figures = {"files": {path: describe(part) for path, part in parts}}
+    files = {path: describe(part) for path, part in parts}
+    figures = {"files": files, "repeated": distinct.repeated}
     x, y, z, codes, last, source = points.T
     values = {
         "all": ("density", np.add, 1, 0),
@@ -134,9 +132,8 @@ def reduce_for_report(
     ground = np.isin(codes, TERRAIN)
     window, cell = _cells(x[ground], y[ground], rules.strip)
     size = max(1, window.width * window.height)
-    key, which, count = np.unique(
-        source[ground] * size + cell, return_inverse=True, return_counts=True
-    )
+    both = source[ground] * size + cell
+    key, which, count = np.unique(both, return_inverse=True, return_counts=True)
     sums = np.zeros(len(key), np.int64)
     np.add.at(sums, which, z[ground])
     row, column = np.divmod(key % size, max(1, window.width))
@@ -164,9 +161,7 @@ def _cells(x: Integers, y: Integers, side: float) -> tuple[GridWindow, Integers]
     return window, window.flat_index(column, row)
 
 
-def compare_strips(
-    files: Sequence[str], window: GridWindow, rules: ReportRules, target: str
-) -> dict:
+def compare_strips(files: list[str], window: GridWindow, rules: ReportRules, target: str) -> dict:
     """Compare the ground of strips in a window of cells; save and return what differs.
 
     The arrays are ``differences`` (k, 4) int64: a source, a greater one, the greater one's mean
@@ -182,9 +177,8 @@ def compare_strips(
     inner = window.slices_in(around)
     flat = (slope <= rules.max_slope)[inner]
     sources = np.unique(rows[:, 0]).tolist()
-    of_source = {
-        s: _means(rows[rows[:, 0] == s], cell[rows[:, 0] == s], around)[inner] for s in sources
-    }
+    chosen = {source: rows[:, 0] == source for source in sources}
+    of_source = {s: _means(rows[own], cell[own], around)[inner] for s, own in chosen.items()}
     differences, cells = [np.empty((0, 4), np.int64)], [np.empty((0, 4), np.int64)]
     for a, b in combinations(sources, 2):
         both = of_source[b] - of_source[a]
@@ -193,9 +187,8 @@ def compare_strips(
             value = np.rint(both[row, column]).astype(np.int64)
             number, count = np.unique(value, return_counts=True)
             differences.append(np.column_stack([0 * number + a, 0 * number + b, number, count]))
-            x, y = (
-                steps((k + 0.5) * rules.strip) for k in (column + window.left, row + window.bottom)
-            )
+            places = column + window.left, row + window.bottom
+            x, y = (steps((number + 0.5) * rules.strip) for number in places)
             at = np.column_stack(_numbers(x, y, rules.density))
             cells.append(np.column_stack([at, value**2, 0 * value + 1]))
     arrays = {"differences": _sum_up(differences, 3), "cells": _sum_up(cells, 2)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -18,32 +18,36 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, write_json, write_whole
 from ..base.grid import GridWindow
-from ..base.hashing import fingerprint
 from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.inputs import Survey
-from ..tiling.jobs import Job, load_arrays
+from ..tiling.jobs import Job
 from ..tiling.options import TilingOptions
-from ..tiling.tile_records import RecordRun, earlier_layout, plan_of_records, record_run
-from .cells import EMPTY, STEPS, SurfaceOptions, lowest
+from ..tiling.tile_records import (
+    RecordRun,
+    Tile,
+    cells_in_tile,
+    earlier_layout,
+    plan_of_records,
+    record_run,
+)
+from .cells import EMPTY, STEPS, lowest
 from .make_surfaces import enclose
-from .rasters import TileCells
 from .report_page import Rasters, render_report
-from .survey_cells import ReportRules, combine, compare_strips, reduce_for_report
+from .survey_cells import ReportRules, combine, compare_strips, figures_of, reduce_for_report
 from .triangulation import heights_at
 
 #: Width of pictures in pixels, and voids and control points that are listed, as many as fit a page.
 _WIDTH, _LISTED = 820, 10
 #: NSSDA: 95 % of normally distributed errors are smaller than this times their RMSE.
 NSSDA = 1.96
-#: What the arrays of tiles are named after.
-_REDUCED, _STRIPS = "report", "strips"
+#: How rasters of tiles become one, and what a cell without points holds.
 _MERGES = {
-    "all": (np.add, 0),
-    "last": (np.add, 0),
-    "void": (np.maximum, 0),
-    "picture": (np.maximum, EMPTY),
-}
+    "all": (np.add, 0), "last": (np.add, 0),
+    "void": (np.maximum, 0), "picture": (np.maximum, EMPTY),
+}  # fmt: skip
+#: x, y, z and name of a control point.
+Control = tuple[float, float, float, str]
 
 
 def write_report(
@@ -79,7 +83,7 @@ def write_report(
     """
     checks.number("--density", density, 0, 1e6)
     checks.number("--void", void, 0.01, 1e4, unit="m2")
-    points = read_control(control)
+    points = read_control(control) if control else []
     outputs = [Output(page, "report", HTML)] + [Output(json_file, "json", JSON)] * bool(json_file)
     files = input_files(inputs)
     check_outputs(outputs, [*files, *([control] if control else [])])
@@ -93,37 +97,29 @@ def write_report(
     return result
 
 
-def read_control(path: str) -> list[tuple[float, float, float, str]]:
+def read_control(path: str) -> list[Control]:
     """Return the control points of a CSV file: x, y, z and a name, with or without a heading."""
-    points: list[tuple[float, float, float, str]] = []
-    if not path:
-        return points
+    points: list[Control] = []
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            for number, row in enumerate(csv.reader(file), 1):
-                try:
-                    x, y, z = map(float, row[:3])
-                except ValueError:
-                    if row and number > 1:
-                        place, cure = (
-                            f"{path}, line {number}",
-                            "Write x,y,z and, if you like, a name",
-                        )
-                        what = "a control point is not three numbers"
-                        raise StageError(
-                            what, where=place, found=",".join(row), cure=cure
-                        ) from None
-                    continue
-                points.append((x, y, z, ",".join(row[3:]).strip() or str(len(points) + 1)))
+            rows = [*csv.reader(file)]
     except (OSError, UnicodeError) as error:
         raise StageError("the control points cannot be read", where=path, found=error) from None
+    for number, row in enumerate(rows, 1):
+        try:
+            x, y, z = map(float, row[:3])
+            points.append((x, y, z, ",".join(row[3:]).strip() or str(len(points) + 1)))
+        except ValueError:
+            if row and number > 1:
+                what, place = "a control point is not three numbers", f"{path}, line {number}"
+                raise StageError(what, where=place, found=",".join(row)) from None
     if not points:
         raise StageError("the file has no control points", where=path)
     return points
 
 
 def _measure(
-    run: RecordRun, ordered: float, void: float, control: Sequence[tuple[float, float, float, str]]
+    run: RecordRun, ordered: float, void: float, control: Sequence[Control]
 ) -> tuple[dict[str, Any], Rasters]:
     """Reduce all tiles; return the figures, and rasters to draw."""
     survey, unit = run.survey, run.survey.unit
@@ -140,11 +136,10 @@ def _measure(
     places = np.array([point[:2] for point in control]).reshape(-1, 2)
     settings = {**asdict(rules), "places": places.tolist()}
     reduce = partial(reduce_for_report, rules=rules, control=places)
-    jobs = run.reduce(_REDUCED, settings, reduce)
+    jobs = run.reduce("report", settings, reduce)
     files: dict[str, list[Any]] = {}
-    for job in jobs:
-        for path, described in job.record["files"].items():
-            files.setdefault(path, []).append(described)
+    for path, described in (item for job in jobs for item in job.record["files"].items()):
+        files.setdefault(path, []).append(described)
     by_file = {path: combine(files[path]) for path in survey.paths if path in files}
     rasters = Rasters(rules, unit, {name: _merge(run, jobs, name) for name in _MERGES})
     strips, rasters.strips = _strips(run, jobs, rules, units.vertical)
@@ -152,20 +147,20 @@ def _measure(
         "version": __version__,
         "reference": survey.reference.name,
         "meters_per_unit": {"horizontal": units.horizontal, "vertical": units.vertical},
-        "survey": combine(by_file.values()),
-        "files": by_file,
+        "survey": figures_of(combine([*by_file.values()])),
+        "files": {path: figures_of(described) for path, described in by_file.items()},
+        "repeated": sum(job.record["repeated"] for job in jobs),
         **_density(rasters, ordered),
         "strips": strips,
         "control": _control(run, jobs, control, rules, units.vertical) if control else None,
     }
-    run.forget((_REDUCED, _STRIPS))
     return result, rasters
 
 
 def _merge(run: RecordRun, jobs: Sequence[Job], name: str) -> tuple[GridWindow, NDArray[np.int64]]:
     """Return a raster of all tiles."""
     merge, empty = _MERGES[name]
-    loaded = [load_arrays(run.path_of(job), (name, f"{name}_window")) for job in jobs]
+    loaded = run.arrays(jobs, name, f"{name}_window")
     windows = [GridWindow(*arrays[f"{name}_window"].tolist()) for arrays in loaded]
     if not any(w.width for w in windows):
         raise StageError("no point is neither noise nor withheld", found=run.survey.paths[0])
@@ -191,81 +186,58 @@ def _density(rasters: Rasters, ordered: float) -> dict[str, Any]:
     window, held = rasters.of["void"]
     inside = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(held > 0, 2), iterations=2))
     inside = inside[2:-2, 2:-2] | (held > 0)
-    label = ndimage.label(inside & (held == 0), np.ones((3, 3)))[0]
-    rasters.voids = label
-    area = inside.sum() * cell_m**2
-    density: dict[str, Any] = {
-        "cell_m": side_m,
-        "cells": int(inner.sum()),
-        "ordered": ordered or None,
-    }
+    label, count = ndimage.label(inside & (held == 0), np.ones((3, 3)))
+    area = float(inside.sum() * cell_m**2)
+    density: dict[str, Any] = {"cell_m": side_m, "cells": int(inner.sum()), "ordered": ordered}
     for name, points in (("all", all_points), ("last", last)):
         each = points[inner] / side_m**2
+        known, judged = len(each) > 0, ordered > 0 and len(each) > 0
         density[name] = {
             "mean": float(points.sum() / area),
-            "median": float(np.median(each)) if len(each) else None,
-            "share_below": float((each < ordered).mean()) if ordered and len(each) else None,
+            "median": float(np.median(each)) if known else None,
+            "share_below": float((each < ordered).mean()) if judged else None,
         }
+    # Cells with points beside a void, by its number, and how many of them are water.
+    beside = np.where(held > 0, ndimage.maximum_filter(label, 3), 0)
+    around, water = (np.bincount(beside[held >= least], minlength=count + 1) for least in (1, 2))
+    is_void = 2 * water < np.maximum(around, 1)
+    is_void[0] = False
+    rasters.voids = is_void[label]
+    sizes = np.bincount(label[rasters.voids], minlength=count + 1) * cell_m**2
+    middles = ndimage.center_of_mass(label > 0, label, np.flatnonzero(is_void))
     voids: list[dict[str, Any]] = []
-    for number, box in enumerate(ndimage.find_objects(label), 1):
-        around = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box)
-        here = label[around] == number
-        border = ndimage.binary_dilation(here, np.ones((3, 3))) & (held[around] > 0)
-        if np.count_nonzero(held[around][border] == 2) < 0.5 * max(1, border.sum()):
-            row, column = (axis.mean() for axis in np.nonzero(label[box] == number))
-            cell = window.left + box[1].start + column, window.bottom + box[0].start + row
-            at = [round((value + 0.5) * rasters.rules.void, 2) for value in cell]
-            voids.append({"area_m2": float(here.sum() * cell_m**2), "at": at})
-        else:
-            rasters.voids[box][label[box] == number] = 0
+    for area_m2, (row, column) in zip(sizes[is_void], middles, strict=True):
+        cell = window.left + column, window.bottom + row
+        at = [round((number + 0.5) * rasters.rules.void, 2) for number in cell]
+        voids.append({"area_m2": float(area_m2), "at": at})
     voids.sort(key=lambda each: (-each["area_m2"], each["at"]))
-    figures = {
-        "cell_m2": cell_m**2,
-        "count": len(voids),
-        "area_m2": sum(each["area_m2"] for each in voids),
-        "share": sum(each["area_m2"] for each in voids) / area,
-        "largest": voids[:_LISTED],
-    }
-    return {"area_m2": float(area), "density": density, "voids": figures}
+    total = float(sizes.sum())
+    figures = {"cell_m2": cell_m**2, "count": len(voids), "area_m2": total, "share": total / area}
+    return {"area_m2": area, "density": density, "voids": {**figures, "largest": voids[:_LISTED]}}
 
 
 def _strips(
     run: RecordRun, jobs: Sequence[Job], rules: ReportRules, vertical: float
 ) -> tuple[list[dict[str, Any]], NDArray[np.int64]]:
     """Compare the ground of strips; return pairs, worst first, and cells of density with errors."""
-    grid, unit = run.survey.grid, run.survey.unit
-    files = {job.tile: run.path_of(job) for job in jobs}
-    marks = {job.tile: job.mark for job in jobs}
-    cells = TileCells(SurfaceOptions(rules.strip), grid, unit, (0.0, 0.0, 0.0, 0.0), files)
-    near = {job.tile: cells.near(job.tile, 2 * rules.strip).files for job in jobs}
-    compared = [
-        Job(
-            job.name.replace(_REDUCED, _STRIPS),
-            job.points,
-            job.tile,
-            mark=fingerprint(asdict(rules), [marks[tile] for tile in near[job.tile]]),
-        )
-        for job in jobs
-    ]
 
-    def task_of(job: Job) -> partial:
-        window, names = cells.own_cells(job.tile), list(near[job.tile].values())
-        return partial(compare_strips, names, window, rules, run.path_of(job))
+    def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Any]:
+        window = cells_in_tile(run.survey.grid, tile, rules.strip)
+        return partial(compare_strips, [*files.values()], window, rules, target)
 
-    run.compute("strips", compared, task_of)
-    loaded = [load_arrays(run.path_of(job)) for job in compared]
+    tiles = [job.tile for job in jobs]
+    compared = run.compute("strips", jobs, tiles, 2 * rules.strip, compute)
+    loaded = run.arrays(compared, "differences", "cells")
     rows = np.concatenate([arrays["differences"] for arrays in loaded])
     pairs: list[dict[str, Any]] = []
     for a, b in np.unique(rows[:, :2], axis=0).tolist():
         value, count = rows[(rows[:, 0] == a) & (rows[:, 1] == b)][:, 2:].T
         order = np.argsort(value, kind="stable")
         middle = np.searchsorted(np.cumsum(count[order]), count.sum() / 2)
-        scale = vertical / STEPS
-        rms = math.sqrt((value.astype(float) ** 2 * count).sum() / count.sum()) * scale
-        median = float(value[order][middle] * scale)
-        pairs.append(
-            {"strips": [a, b], "cells": int(count.sum()), "median_m": median, "rms_m": rms}
-        )
+        rms = math.sqrt((value.astype(float) ** 2 * count).sum() / count.sum())
+        values = {"median_m": float(value[order][middle]), "rms_m": rms}
+        in_meters = {name: value * vertical / STEPS for name, value in values.items()}
+        pairs.append({"strips": [a, b], "cells": int(count.sum()), **in_meters})
     pairs.sort(key=lambda pair: (-pair["rms_m"], pair["strips"]))
     return pairs, np.concatenate([arrays["cells"] for arrays in loaded])
 
@@ -273,15 +245,13 @@ def _strips(
 def _control(
     run: RecordRun,
     jobs: Sequence[Job],
-    control: Sequence[tuple[float, float, float, str]],
+    control: Sequence[Control],
     rules: ReportRules,
     vertical: float,
 ) -> dict[str, Any]:
     """Compare the terrain, through all ground points, with control points."""
-    ground = np.concatenate(
-        [load_arrays(run.path_of(job), ("control",))["control"] for job in jobs]
-    )
-    ground = lowest(ground, 1.0)  # one of points at the same place
+    near_any = [arrays["control"] for arrays in run.arrays(jobs, "control")]
+    ground = lowest(np.concatenate(near_any), 1.0)  # one of points at the same place
     reach, everywhere = rules.around_control * STEPS, (math.inf, math.inf, -math.inf, -math.inf)
     rows: list[dict[str, Any]] = []
     outside = []
@@ -316,11 +286,8 @@ def lines(result: Mapping[str, Any]) -> list[str]:
         f"{voids['count']:,} voids, {voids['area_m2']:,.0f} m2 ({100 * voids['share']:.2f} %)",
     ]
     for pair in result["strips"][:1]:
-        out.append(
-            "strips {} and {}: median {:+.3f} m, RMS {:.3f} m".format(
-                *pair["strips"], pair["median_m"], pair["rms_m"]
-            )
-        )
+        text = "strips {} and {}: median {median_m:+.3f} m, RMS {rms_m:.3f} m"
+        out.append(text.format(*pair["strips"], **pair))
     if control and control["points"]:
         out.append("control points: mean {mean_m:+.3f} m, RMSE {rmse_m:.3f} m".format(**control))
     return out

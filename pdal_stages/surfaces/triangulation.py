@@ -65,33 +65,19 @@ def _fan_circles(xy: Integers, triangles: Integers) -> Integers:
     shared = np.flatnonzero(~begins_run(key[order]))
     one, two = order[shared - 1], order[shared]
     on_circle = _on_one_circle(xy, triangles[owner[one]], opposite[two])
-    one, two = owner[one[on_circle]], owner[two[on_circle]]
+    one, two = one[on_circle], two[on_circle]
     count = len(triangles)
-    pairs = coo_array((np.ones(len(one)), (one, two)), shape=(count, count))
-    group = connected_components(pairs, directed=False)[1]
-    several = np.bincount(group)[group] > 1
-    rest, group = triangles[several], np.repeat(group[several], 3)
-    # The points of each circle, once, the first of them in front.
-    at = np.lexsort((rest.reshape(-1), group))
-    group, point = group[at], rest.reshape(-1)[at]
-    once = begins_run(group) | begins_run(point)
-    group, point = group[once], point[once]
-    begins = begins_run(group)
-    first = point[begins][np.cumsum(begins) - 1]
-    away = (xy[point] - xy[first])[~begins]
-    group, point, first = group[~begins], point[~begins], first[~begins]
-    # From a point of a circle, the others lie within half a turn: the angle from the first of them
-    # orders them without a jump.
-    start = away[begins_run(group)][np.cumsum(begins_run(group)) - 1]
-    angle = np.arctan2(
-        (start[:, 0] * away[:, 1] - start[:, 1] * away[:, 0]).astype(float),
-        (start * away).sum(axis=1).astype(float),
-    )
-    at = np.lexsort((angle, group))
-    group, point, first = group[at], point[at], first[at]
-    next_to = np.flatnonzero(~begins_run(group))
-    fans = np.column_stack([first[next_to], point[next_to - 1], point[next_to]])
-    return np.concatenate([triangles[~several], fans])
+    pairs = coo_array((np.ones(len(one)), (owner[one], owner[two])), shape=(count, count))
+    circle = connected_components(pairs, directed=False)[1]
+    # Each circle's first point is joined to the sides of its polygon, which lie in no two of its
+    # triangles.
+    first = np.full(count, len(xy))
+    np.minimum.at(first, circle, triangles.min(axis=1))
+    several, outer = np.bincount(circle)[circle] > 1, np.ones(len(owner), bool)
+    outer[one] = outer[two] = False
+    apex = first[circle[owner]]
+    fan = outer & several[owner] & (sides != apex[:, None]).all(axis=1)
+    return np.concatenate([triangles[~several], np.column_stack([apex, sides])[fan]])
 
 
 def _on_one_circle(xy: Integers, triangle: Integers, point: Integers) -> NDArray[np.bool_]:
@@ -210,16 +196,11 @@ def _height_in(points, a, b, c, x, y):
     ac = _area(points, a, c, x, y)
     if not ((ab >= 0 and bc >= 0 and ac <= 0) or (ab <= 0 and bc <= 0 and ac >= 0)):
         return 0.0, OUTSIDE
-    zeros = (ab == 0) + (bc == 0) + (ac == 0)
-    if zeros == 3:  # no triangle
-        return 0.0, OUTSIDE
-    if zeros == 2:
-        return points[b if ac != 0 else (a if bc != 0 else c), 2], ON_SIDE
-    if zeros == 1:
-        one, two = (a, b) if ab == 0 else ((b, c) if bc == 0 else (a, c))
-        dx, dy = points[two, 0] - points[one, 0], points[two, 1] - points[one, 1]
-        part = (x - points[one, 0]) / dx if abs(dx) >= abs(dy) else (y - points[one, 1]) / dy
-        return points[one, 2] + part * (points[two, 2] - points[one, 2]), ON_SIDE
+    for one, two, area in ((a, b, ab), (b, c, bc), (a, c, ac)):
+        if area == 0:
+            dx, dy = points[two, 0] - points[one, 0], points[two, 1] - points[one, 1]
+            part = (x - points[one, 0]) / dx if abs(dx) >= abs(dy) else (y - points[one, 1]) / dy
+            return points[one, 2] + part * (points[two, 2] - points[one, 2]), ON_SIDE
     whole = ab + bc - ac
     rise = -ac * (points[b, 2] - points[a, 2]) + ab * (points[c, 2] - points[a, 2])
     return points[a, 2] + rise / whole, INSIDE

@@ -7,22 +7,25 @@ records.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.grid import GridWindow
 from ..base.hashing import fingerprint
-from ..base.messages import print_messages
+from ..base.messages import count_of, print_messages
 from ..base.version import build
 from ..pipeline.las_files import laspy_header
 from .inputs import InputSource, Survey
-from .jobs import Job, Store, save_arrays
+from .jobs import Job, Store, load_arrays, save_arrays
 from .options import TileGrid, TilingOptions
 from .plan import Round, TilePlan
 from .sorted_points import coordinates, points_near
@@ -31,6 +34,11 @@ from .tiled_run import SurveyRun, workers_of
 #: Reduces the points of a tile, a path and a laspy record for each input that has any there, to
 #: arrays and figures that JSON can hold.
 Reduce = Callable[[list[tuple[str, Any]]], tuple[dict[str, NDArray], dict[str, Any]]]
+#: Column and row of a tile.
+Tile = tuple[int, int]
+#: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
+#: writes it to a file, and returns figures.
+Compute = Callable[[Tile, dict[Tile, str], str], Callable[[], Any]]
 #: Reasons that are shown where tiles fail.
 _MOST_REASONS = 3
 
@@ -52,38 +60,72 @@ class RecordRun(SurveyRun):
         The arrays lie in :meth:`path_of` the job. `settings` are all that affects them beside the
         points.
         """
-        survey, jobs = self.survey, []
+        survey, grid = self.survey, self.survey.grid
         self.read_inputs()
-        self._refuse_faults()
-        for tile, points in survey.tiles().items():
-            content = [source.content for source in survey.near(tile, 0.0)]
-            mark = fingerprint(build(), name, settings, vars(survey.grid), tile, content)
-            jobs.append(Job(f"{survey.grid.name(tile)}.{name}", points, tile, mark=mark))
+        tiles = survey.tiles()
+        near = {tile: survey.near(tile, 0.0) for tile in tiles}
+        marks = {tile: [settings, [each.content for each in near[tile]]] for tile in tiles}
+        jobs = self._jobs(name, tiles, marks)
         waiting = self._without_arrays(jobs)
-        self.read_inputs({s.path for job in waiting for s in survey.near(job.tile, 0.0)})
-        self._refuse_faults()
+        self.read_inputs({source.path for job in waiting for source in near[job.tile]})
+        if faults := survey.faults:  # a result would have holes
+            found = "; ".join(f"{path}: {why}" for path, why in [*faults.items()][:_MOST_REASONS])
+            raise StageError(f"{len(faults)} of the inputs cannot be read", found=found)
 
         def task_of(job: Job) -> Callable[[], Any]:
-            near, target = survey.near(job.tile, 0.0), self.path_of(job)
-            return partial(_reduce_tile, survey.grid, job.tile, near, reduce, target)
+            sources = near[job.tile]
+            return partial(_reduce_tile, grid, job.tile, sources, reduce, self.path_of(job))
 
         self._finish("reducing tiles", waiting, task_of)
         return jobs
 
     def compute(
-        self, what: str, jobs: Sequence[Job], task_of: Callable[[Job], Callable[[], Any]]
-    ) -> None:
-        """Run jobs that write arrays into :meth:`path_of` and return figures, as of records."""
-        self._finish(what, self._without_arrays(jobs), task_of)
+        self,
+        name: str,
+        reduced: Sequence[Job],
+        tiles: Iterable[Tile],
+        reach: float,
+        compute: Compute,
+    ) -> list[Job]:
+        """Compute results of tiles from the arrays of reduced ones within a reach; return the jobs.
+
+        Tiles with no reduced ones around have no result. The reach is in the unit of the
+        coordinates.
+        """
+        grid, of_tile = self.survey.grid, {job.tile: job for job in reduced}
+        wide = range(-math.ceil(reach / grid.size), math.ceil(reach / grid.size) + 1)
+        near: dict[Tile, list[Job]] = {}
+        for i, j in tiles:
+            around = [
+                of_tile[i + k, j + l] for l in wide for k in wide if (i + k, j + l) in of_tile
+            ]
+            near |= {(i, j): around} if around else {}
+        marks = {tile: [job.mark for job in around] for tile, around in near.items()}
+        points = {tile: of_tile[tile].points if tile in of_tile else 1 for tile in near}
+        jobs = self._jobs(name, points, marks)
+
+        def task_of(job: Job) -> Callable[[], Any]:
+            files = {each.tile: self.path_of(each) for each in near[job.tile]}
+            return compute(job.tile, files, self.path_of(job))
+
+        self._finish(name, self._without_arrays(jobs), task_of)
+        return jobs
 
     def path_of(self, job: Job) -> str:
         """Return the file of a job's arrays."""
         return self.store.path(job.name)
 
-    def forget(self, names: Collection[str]) -> None:
-        """Remove the arrays of jobs of some names, the last parts of theirs."""
-        for name in names:
-            self.store.remove(f".{name}.npz")
+    def arrays(self, jobs: Sequence[Job], *names: str) -> list[dict[str, NDArray]]:
+        """Return arrays of jobs."""
+        return [load_arrays(self.path_of(job), names) for job in jobs]
+
+    def _jobs(self, name: str, points: Mapping[Tile, int], marks: Mapping[Tile, Any]) -> list[Job]:
+        """Return jobs for tiles with their numbers of points, and with what affects each."""
+        grid, common = self.survey.grid, [build(), name, vars(self.survey.grid)]
+        return [
+            Job(f"{grid.name(tile)}.{name}", n, tile, mark=fingerprint(common, tile, marks[tile]))
+            for tile, n in points.items()
+        ]
 
     def _without_arrays(self, jobs: Sequence[Job]) -> Any:
         """Return the jobs that no earlier run has finished, in their order."""
@@ -92,19 +134,12 @@ class RecordRun(SurveyRun):
                 self.store.forget(job.name)
         return self.unkept(jobs)
 
-    def _refuse_faults(self) -> None:
-        """Refuse a survey of which a file cannot be read: a result would have holes."""
-        if faults := self.survey.faults:
-            found = "; ".join(f"{path}: {why}" for path, why in [*faults.items()][:_MOST_REASONS])
-            raise StageError(f"{len(faults)} of the inputs cannot be read", found=found)
-
     def _finish(self, what: str, waiting: Any, task_of: Callable[[Job], Callable[[], Any]]) -> None:
         """Run jobs; StageError where one fails."""
-        count = len(waiting)
         failed = [job.reason for job in self.do(what, waiting, task_of) if job.reason]
         if failed:
             raise StageError(
-                f"{len(failed)} of {count} tiles failed: nothing was written",
+                f"{count_of(len(failed), 'tile')} failed: nothing was written",
                 found="; ".join(dict.fromkeys(failed[:_MOST_REASONS])),
                 cure="Continue with --resume, for example with a smaller --tile or more --memory",
             )
@@ -128,6 +163,7 @@ def record_run(
         store.finish("run", "", survey.layout)
         with workers_of(options, str(store.folder)) as workers:
             yield RecordRun(survey, store, workers, progress)
+        store.remove(".npz")
     if changed := survey.changed():
         print_messages(f"{changed[0]} changed during the run: run it again")
 
@@ -138,12 +174,20 @@ def earlier_layout(folder: Path, chosen: TilingOptions) -> dict[str, Any] | None
     return known if "square" in known else None
 
 
+def cells_in_tile(grid: TileGrid, tile: Tile, side: float) -> GridWindow:
+    """Return the cells of a side whose centers lie in a tile; a window of none where there is none.
+
+    The side is in the unit of the coordinates.
+    """
+    sides = []
+    for number, low in zip(tile, grid.box(tile)[:2], strict=True):
+        cells = math.floor(low / side) - 1 + np.arange(math.ceil(grid.size / side) + 3.0)
+        sides.append(cells[grid.index((cells + 0.5) * side) == number].astype(np.int64))
+    return GridWindow.enclosing(*sides) if all(map(len, sides)) else GridWindow(0, 0, 0, 0)
+
+
 def _reduce_tile(
-    grid: TileGrid,
-    tile: tuple[int, int],
-    sources: Sequence[InputSource],
-    reduce: Reduce,
-    target: str,
+    grid: TileGrid, tile: Tile, sources: Sequence[InputSource], reduce: Reduce, target: str
 ) -> dict[str, Any]:
     """Read the points of a tile, save the arrays they are reduced to, and return the figures."""
     arrays, figures = reduce(points_of_tile(grid, tile, sources))
@@ -152,7 +196,7 @@ def _reduce_tile(
 
 
 def points_of_tile(
-    grid: TileGrid, tile: tuple[int, int], sources: Sequence[InputSource]
+    grid: TileGrid, tile: Tile, sources: Sequence[InputSource]
 ) -> list[tuple[str, Any]]:
     """Return the inputs with points in a tile, and these as laspy's records."""
     import laspy

@@ -336,6 +336,7 @@ class Surfaces(_Showing):
         "the terrain, on one grid without seams. The points must be classified."
     )
     listed = ("resolution", "fill", "max_radius", "resume")
+    handled = ("folder",)
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
@@ -442,7 +443,7 @@ class Report(Algorithm):
         "and control points from a table. The page is under Processing > Results Viewer."
     )
     listed = ("density", "void")
-    handled = ("control", "json")
+    handled = ("control", "json", "page")
 
     def initAlgorithm(self, configuration=None):
         self.add_inputs(self.help_of("inputs"))
