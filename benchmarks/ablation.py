@@ -46,11 +46,11 @@ from surveys import GROUND, SURVEYS, VEGETATION
 
 from pdal_stages.structures import decks, wires
 from pdal_stages.terrain import (
+    detached,
     detached_noise,
     filter_options,
     filtered_ground,
     low_outliers,
-    noise,
     openings,
     regain,
     smrf,
@@ -306,11 +306,12 @@ ROWS: dict[str, dict[str, Row]] = {
     },
     "noise": {
         "as it is": Row(),
-        "extent does not grow with density": rule(noise, extent_growth=0.0),
-        "voxels are not widened in thin clouds": rule(noise, scales=0),
-        "gap does not grow in thin clouds": rule(noise, gap_growth=0.0),
-        "what hangs in line is noise": rule(noise, strung=99),
-        "single points of wires are noise": rule(noise, strung_share=9.0),
+        "voxels do not widen in thin clouds": rule(detached, sides=(2.0,)),
+        "sparse swarms hold": rule(detached, min_mean=0.0),
+        "nearly empty voxels hold": rule(detached, min_mean=0.0, min_around=0),
+        "dense clusters stay small": rule(detached, cluster_area_m2=0.0),
+        "long pieces of wires are clusters": rule(detached, line_columns=99),
+        "nothing holds what is near": rule(detached, hold_columns=0, hold_sides=0.0),
         "low: no ground as deep is looked for": rule(low_outliers, min_company=10**6),
         "low: ground as deep needs no support": rule(
             low_outliers, min_support=-1, min_support_share=0.0

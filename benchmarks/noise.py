@@ -3,6 +3,7 @@
 python benchmarks/noise.py --data FOLDER
 python benchmarks/noise.py --data FOLDER --classify
 python benchmarks/noise.py --data FOLDER --terrain
+python benchmarks/noise.py --data FOLDER --surveys
 python benchmarks/noise.py --places
 
 Noise as the field knows it is put into each cloud: points and clusters of 2 to 30 within a meter,
@@ -10,8 +11,12 @@ half of them 1 to 30 m below the ground (the lowest of what is labeled ground, a
 near by), half 3 to 300 m above the highest point near by. `good` are labeled points other than
 noise; speed is in points per CPU second of one thread. With --classify and --terrain, clusters of
 all sizes are put below the ground: what the shipped model then calls right of the labeled points,
-and how far off the ground filter's heights are, with noise marked first and without. With --places,
-generated land that holds no noise: how much of its ground is marked.
+and how far off the ground filter's heights are, with noise marked first and without. With --surveys, copies of the 29 training surveys with ten kinds of
+noise at once (:func:`kinds_of_noise`): how much of each is found, in all and of what is more than
+5 m from every good point, and how many good points are marked, by this stage, by PDAL's
+filters.outlier (statistical, 8 neighbors, multiplier 3) and by counts in voxels of 1 m (lasR's ivf:
+at most 6 points in 27 voxels). With --places, generated land that holds no noise: how much of its
+ground is marked.
 """
 
 from __future__ import annotations
@@ -28,6 +33,10 @@ import laspy
 import numpy as np
 from scipy.spatial import cKDTree
 from woods import closed_wood
+
+sys.path.insert(0, str(Path(__file__).resolve().parent / "surveys"))
+from clouds import published
+from surveys import SURVEYS
 
 from pdal_stages import detached_noise, filtered_ground
 from pdal_stages.cli import main as command
@@ -245,17 +254,133 @@ def places() -> None:
         print(f"| {what} | {' | '.join(f'{100 * share:.3f}' for share in marked)} |", flush=True)
 
 
+def kinds_of_noise(xyz: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+    """Return noise of each kind, its coordinates, for a cloud without any.
+
+    Veils are even from the ground to 60 m above, with 0.1, 0.5 and 2 % as many points as the cloud;
+    single points and birds (2 to 30 points) hang above the canopy; blobs, columns and sheets hold the
+    points of 0.5 to 4 m2 of ground, thin clouds 30 to 60 points over 20 m, swarms those of 1 to 5 m2.
+    """
+    rng, tree = np.random.default_rng(seed), cKDTree(xyz[:, :2])
+    squares = np.unique(np.floor(xyz[:, :2] / 2), axis=0)
+    density = len(xyz) / (4 * len(squares))
+
+    def places(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        at = xyz[rng.integers(len(xyz), size=number), :2] + rng.uniform(-1, 1, (number, 2))
+        near = xyz[tree.query(at, 12)[1], 2]
+        return at, near.min(axis=1), near.max(axis=1)
+
+    def groups(number: int, points: tuple, shape: tuple, size: tuple, height: tuple) -> np.ndarray:
+        parts = []
+        for at, top in zip(*places(number)[::2], strict=True):
+            part = rng.normal(0, 1, (int(rng.uniform(*points)), 3)) * shape * rng.uniform(*size)
+            part[:, 2] += top + rng.uniform(*height) - part[:, 2].min()
+            parts.append(part + np.append(at, 0))
+        return np.vstack(parts)
+
+    noise = {}
+    for share in (0.001, 0.005, 0.02):
+        at, ground, _ = places(max(int(share * len(xyz)), 20))
+        noise[f"veil {share:.1%}"] = np.column_stack([at, ground + rng.uniform(0, 60, len(at))])
+    at, _, top = places(max(len(xyz) // 2000, 30))
+    noise["single"] = np.column_stack([at, top + rng.uniform(3, 200, len(at))])
+    flocks = max(len(xyz) // 15_000, 6)
+    noise["birds"] = groups(flocks, (2, 31), (1, 1, 1), (0.4, 0.4), (4, 100))
+    noise["thin clouds"] = groups(3, (30, 60), (1, 1, 1), (4, 4), (30, 100))
+    few, many = (np.clip(np.array(m2) * density, 10, 2000) for m2 in ((0.5, 4), (1, 5)))
+    for name, shape in (("blobs", (1, 1, 1)), ("columns", (0.4, 0.4, 3)), ("sheets", (2, 2, 0.3))):
+        noise[name] = groups(4, tuple(few), shape, (0.7, 1.5), (4, 30))
+    noise["swarms"] = groups(3, tuple(many), (1, 1, 1), (2, 4), (0, 8))
+    return noise
+
+
+def find_outliers(xyz: np.ndarray) -> np.ndarray:
+    """Return what PDAL's filters.outlier finds (statistical, 8 neighbors, multiplier 3)."""
+    mean = cKDTree(xyz).query(xyz, 9)[0][:, 1:].mean(axis=1)
+    return mean > mean.mean() + 3 * mean.std()
+
+
+def find_isolated_voxels(xyz: np.ndarray) -> np.ndarray:
+    """Return what lasR's ivf finds: at most 6 points in a voxel of 1 m and the 26 around it."""
+    place = np.floor(xyz).astype(np.int64)
+    place -= place.min(axis=0) - 1
+    size = place.max(axis=0) + 2
+    steps = [np.ravel_multi_index(step, size) for step in np.ndindex(3, 3, 3)]
+    keys, voxel, count = np.unique(
+        np.ravel_multi_index(tuple(place.T), size), return_inverse=True, return_counts=True
+    )
+    around = np.zeros(len(keys), int)
+    for step in steps:
+        other = keys + step - np.ravel_multi_index((1, 1, 1), size)
+        at = np.minimum(np.searchsorted(keys, other), len(keys) - 1)
+        around += np.where(keys[at] == other, count[at], 0)
+    return (around <= 6)[voxel]
+
+
+#: What finds noise, by name.
+FINDERS = {
+    "this stage": lambda xyz: detached_noise(xyz) > 0,
+    "filters.outlier": find_outliers,
+    "voxels of 1 m": find_isolated_voxels,
+}
+
+
+def surveys(folder: Path) -> None:
+    """Print what each finder marks of the surveys' good points, and of noise put into copies."""
+    shares: dict[str, list] = {name: [] for name in FINDERS}
+    print("| survey | finder | good points marked | of wires, towers | noise found, all / far |")
+    print("|---|---|---:|---:|---|")
+    for name, known in SURVEYS.items():
+        xyz, codes, _ = published(folder, known)
+        good = ~np.isin(codes, known.dropped)
+        xyz, codes = xyz[good], codes[good]
+        noise, tree = kinds_of_noise(xyz, 0), cKDTree(xyz)
+        far = {kind: tree.query(part)[0] > 5 for kind, part in noise.items()}
+        for finder, find in FINDERS.items():
+            marked = find(xyz)
+            row = [100 * marked.mean()]
+            lines = [f"{100 * marked[codes == c].mean():.2f}" for c in (14, 15) if c in codes]
+            every = np.split(
+                find(np.vstack([xyz, *noise.values()]))[len(xyz) :],
+                np.cumsum([len(part) for part in noise.values()])[:-1],
+            )
+            for kind, found in zip(noise, every, strict=True):
+                row += [
+                    100 * found.mean(),
+                    100 * found[far[kind]].mean() if any(far[kind]) else np.nan,
+                ]
+            shares[finder].append(row)
+            shown = "; ".join(
+                f"{kind} {row[1 + 2 * k]:.0f} / {row[2 + 2 * k]:.0f}"
+                for k, kind in enumerate(noise)
+            )
+            print(
+                f"| {name} | {finder} | {row[0]:.4f} % | {', '.join(lines)} | {shown} |", flush=True
+            )
+    print("\n| finder | good points marked, mean | worst | " + " | ".join(noise) + " |")
+    print("|---" + "|---:" * (2 + len(noise)) + "|")
+    for finder, rows in shares.items():
+        means = np.nanmean(rows, axis=0)
+        cells = [f"{means[1 + 2 * k]:.0f} / {means[2 + 2 * k]:.0f}" for k in range(len(noise))]
+        worst = max(row[0] for row in rows)
+        print(f"| {finder} | {means[0]:.4f} % | {worst:.3f} % | {' | '.join(cells)} |")
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required="--places" not in sys.argv)
     parser.add_argument("--classify", action="store_true")
     parser.add_argument("--terrain", action="store_true")
+    parser.add_argument("--surveys", action="store_true")
     parser.add_argument("--places", action="store_true")
     options = parser.parse_args()
     folder = options.data
     if options.places:
         places()
+        return
+    if options.surveys:
+        surveys(folder)
         return
     if options.classify:
         classified(folder)

@@ -333,7 +333,7 @@ def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las)
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 60, (2, 40_000))
     wood = (np.arange(40_000) % 4 > 0) & (np.hypot(x - 30, y - 30) < 25)
-    z = np.where(wood, rng.uniform(24, 40, 40_000), 0.0) / FOOT
+    z = np.where(wood, rng.uniform(36, 40, 40_000), 0.0) / FOOT
     returns = {"ReturnNumber": np.where(wood, 1, 2), "NumberOfReturns": np.full(40_000, 2)}
     source = write_las(tmp_path / "in.las", {"X": x + 5e5, "Y": y + 5e6, "Z": z, **returns}, 1)
     referenced(source, {3072: 26910})

@@ -56,6 +56,12 @@ def test_vegetation_too_high_to_be_true_doubts_the_unit_of_z():
         assert not doubt_vertical_unit(fine, 0.0, 1.0)
 
 
+def test_land_in_the_sky_doubts_the_unit_of_z():
+    none = np.zeros(0)
+    assert "above or below the sea" in doubt_vertical_unit(none, 0.0, 1.0, 1_200_000.0)
+    assert not doubt_vertical_unit(none, 0.0, 1.0, 8_849.0)
+
+
 @pytest.mark.parametrize(
     "wkt",
     [

@@ -57,10 +57,13 @@ class UnitDoubts:
     median_slope: float = 1.5
     least_cells: int = 20  #: with two neighbors; fewer may be a single cliff
     most_points: int = 200_000  #: a slope is as good from a sample
+    elevation_m: float = 10_000.0  #: above it there is no land, and below -10,000 none either
 
 
-def doubt_vertical_unit(height_m: NDArray, slope: float, vertical: float) -> str:
-    """Return a warning if vegetation is too high, or ground too steep, to be true, else "".
+def doubt_vertical_unit(
+    height_m: NDArray, slope: float, vertical: float, elevation_m: float = 0.0
+) -> str:
+    """Return a warning if vegetation, ground or its slope is too high to be true, else "".
 
     Parameters
     ----------
@@ -70,6 +73,8 @@ def doubt_vertical_unit(height_m: NDArray, slope: float, vertical: float) -> str
         The ground's :func:`median_slope`.
     vertical : float
         The unit of z that was assumed, in meters.
+    elevation_m : float
+        The points' median elevation, in meters.
 
     Returns
     -------
@@ -83,6 +88,10 @@ def doubt_vertical_unit(height_m: NDArray, slope: float, vertical: float) -> str
         what = f"more than {share} of the vegetation is higher than {limits.vegetation_m:g} m"
     elif slope > limits.median_slope:
         what = f"half of the ground rises by more than {limits.median_slope:g} m a meter"
+    elif abs(elevation_m) > limits.elevation_m:
+        what = (
+            f"half of the points are more than {limits.elevation_m:,.0f} m above or below the sea"
+        )
     else:
         return ""
     return (

@@ -255,9 +255,10 @@ class ApplyModel(Stage, settings=PredictionOptions):
         }
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
         ground = self._may_be_ground(points) if self.given_ground else None
-        slope = (
-            median_slope(points.xyz, points.dimension(_HEIGHT)) if _HEIGHT in points.arrays else 0
-        )
+        slope = elevation = 0.0
+        if _HEIGHT in points.arrays and points.count:
+            slope = median_slope(points.xyz, points.dimension(_HEIGHT))
+            elevation = float(np.median(points.xyz[:, 2]))
         points.keep_only([*dimensions, *self.creates(), _HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             prediction = self.model.predict(
@@ -279,7 +280,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         if _HEIGHT in points.arrays:
             leaves = wanted & np.isin(codes, (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION))
             leaf_heights = points.dimension(_HEIGHT)[leaves]
-            doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical)
+            doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical, elevation)
             points.report.warnings += [doubt] if doubt else []
         values = self._columns(points, prediction)
         if self.mark:

@@ -1,0 +1,380 @@
+"""Points that nothing holds: alone, in thin veils or in small clusters apart from everything.
+
+Space is cut into voxels that are the wider the thinner the cloud is around, so that the surfaces
+and crowns of a survey fill voxels that touch. A voxel is solid if it belongs to a component of
+voxels that touch, none of them nearly empty, and that is large or long and thin as a wire. All else
+is detached: held if something solid is close, loose if not. All is counted on absolute grids, so
+that the order of points, tiles and threads do not matter.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.grid import begins_run
+from ..base.jit import device, njit
+from ..base.threads import map_blocks
+from .components import root_of
+
+#: Side of a block in meters, a multiple of all sides of voxels; density is that of 3 x 3 blocks.
+BLOCK_M = 12.0
+#: Bits of a layer in a key, and the layer 0: what is higher or lower shares the last layer.
+BITS = 36
+LAYERS = 1 << (BITS - 1)
+#: Points or voxels that a thread works on at a time.
+SHARE = 1 << 18
+#: State of what belongs to a large component.
+SOLID: int = 0
+#: State of what is detached and has something solid close.
+HELD: int = 1
+#: State of what is detached and has not.
+LOOSE: int = 2
+
+
+class DetachedRules(NamedTuple):
+    """Thresholds of what is detached; a NamedTuple, as kernels read it.
+
+    Chosen by noise put into copies of the 29 training surveys and by their good points that are
+    marked (benchmarks/noise.py --surveys); what each is worth is in docs/results/ablation.md.
+    """
+
+    #: meters, each a whole part of a block: a voxel's side is the first that is not less than the
+    #: gap times the cube root of `dense_per_m2` / density, for points fill volumes
+    sides: tuple[float, ...] = (1.0, 1.2, 1.5, 2.0, 2.4, 3.0, 4.0, 6.0)
+    dense_per_m2: float = 10.0  #: density at which voxels are as wide as the gap
+    flat_m: float = 1.5  #: voxels are not higher than this, or than half their side
+    min_around: int = 4  #: points in a voxel and the 26 around it: with fewer it is nearly empty
+    min_mean: float = 2.0  #: so it is with fewer per voxel that holds points, as in a swarm ...
+    max_line_voxels: int = 6  #: ... if more voxels than these do: a wire passes through few
+    cluster_area_m2: float = 3.0  #: a cluster may hold as many points as lie on this much ground
+    extent_sides: float = 5.0  #: no cluster is longer than this, in sides of a voxel, ...
+    extent_m: float = 15.0  #: ... and this, in meters
+    line_columns: int = 3  #: a piece of a wire is at least this long, in columns, ...
+    line_m: float = 6.0  #: ... and this, in meters, ...
+    line_variance: float = 0.5  #: ... with at most this variance across, in columns squared, ...
+    line_slope: float = 0.5  #: ... and at most this rise
+    hold_columns: int = 2  #: columns around within which something solid holds a voxel
+    hold_sides: float = 1.5  #: the same up and down, in sides of a voxel
+
+
+RULES = DetachedRules()
+#: How far away, in meters, points change what is detached: by the density of where it begins, by
+#: its component in full, and by those of what may hold it.
+REACH = 3 * BLOCK_M + (RULES.extent_sides + RULES.hold_columns + 2) * RULES.sides[-1]
+
+
+class BlockPoints(NamedTuple):
+    """Points and the blocks that they lie in."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    z: NDArray[np.float64]
+    block: NDArray[np.int64]  #: (n,) its number, row by row
+    left: int  #: the first column of blocks
+    bottom: int  #: the first row
+    shape: tuple[int, int]  #: rows and columns of blocks
+
+
+class Voxels(NamedTuple):
+    """The frame of a grid of voxels."""
+
+    side: float  #: meters
+    height: float  #: meters
+    left: int  #: column of the frame's first
+    bottom: int  #: row of the frame's first
+    width: int  #: columns
+
+    @classmethod
+    def over(cls, points: BlockPoints, side: float) -> Voxels:
+        """Return the voxels of a side over the blocks, with as many columns around as are read."""
+        per_block, rim = round(BLOCK_M / side), RULES.hold_columns
+        left, bottom = (first * per_block - rim for first in (points.left, points.bottom))
+        height = min(side, max(RULES.flat_m, side / 2))
+        return cls(side, height, left, bottom, points.shape[1] * per_block + 2 * rim)
+
+
+def find_detached(
+    x: NDArray, y: NDArray, z: NDArray, cluster: int, gap: float, threads: int | None = None
+) -> NDArray[np.uint8]:
+    """Return which points (n,) are `SOLID`, and of the others which are `HELD` and `LOOSE`.
+
+    Parameters
+    ----------
+    x, y, z : (n,) arrays of float64
+        Meters.
+    cluster : int
+        The most points of a cluster, where these are more than those of `cluster_area_m2`.
+    gap : float
+        Width in meters of voxels at `dense_per_m2` points/m2.
+    """
+    column, row = (np.floor(axis / BLOCK_M).astype(np.int64) for axis in (x, y))
+    left, bottom = column.min(), row.min()
+    shape = int(row.max() - bottom + 1), int(column.max() - left + 1)
+    points = BlockPoints(
+        x, y, z, (row - bottom) * shape[1] + column - left, int(left), int(bottom), shape
+    )
+    count = np.bincount(points.block, minlength=shape[0] * shape[1]).reshape(shape)
+    density = _sum_around(count) / np.maximum(1, _sum_around(count > 0)) / BLOCK_M**2
+    density = np.where(count > 0, density, 1.0)
+    scale = np.searchsorted(RULES.sides, gap * (RULES.dense_per_m2 / density) ** (1 / 3))
+    scale = np.where(count > 0, np.minimum(scale, len(RULES.sides) - 1), -1)
+    most = np.maximum(cluster, RULES.cluster_area_m2 * density)
+    state = np.zeros(len(x), np.uint8)
+    for number in np.unique(scale[scale >= 0]):
+        side = RULES.sides[number]
+        far = max(RULES.extent_sides * side, RULES.extent_m) + (RULES.hold_columns + 2) * side
+        near = _dilate(scale == number, math.ceil(far / BLOCK_M)).ravel()
+        frame = Voxels.over(points, side)
+        keys, counts = _count(points, near, frame, threads)
+        found = _judge(keys, counts, most, frame, threads)
+        detached = np.zeros((keys[-1] >> BITS) + 1, np.bool_)
+        detached[keys[found > SOLID] >> BITS] = True
+        known = frame, (scale == number).ravel(), detached, keys, found
+
+        def assign(share, known=known):
+            _assign(_share(points, share), state[share], *known)
+
+        for _ in map_blocks(assign, _slices(len(x)), threads):
+            pass
+    return state
+
+
+def _sum_around(values: NDArray) -> NDArray[np.int64]:
+    """Sum whole numbers (h, w) over the 3 x 3 places around each."""
+    (h, w), padded = values.shape, np.pad(values.astype(np.int64), 1)
+    return sum((padded[j : j + h, i : i + w] for j in range(3) for i in range(3)), np.int64(0))
+
+
+def _dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """Return the places (h, w) at most `radius` places away, along either axis, from the mask's."""
+    for _ in range(radius):
+        mask = _sum_around(mask) > 0
+    return mask
+
+
+def _slices(number: int) -> list[slice]:
+    """Return slices of `SHARE` points."""
+    return [slice(start, start + SHARE) for start in range(0, number, SHARE)]
+
+
+def _share(points: BlockPoints, share: slice) -> BlockPoints:
+    """Return some of the points."""
+    x, y, z, block = points.x[share], points.y[share], points.z[share], points.block[share]
+    return points._replace(x=x, y=y, z=z, block=block)
+
+
+def _count(
+    points: BlockPoints, near: NDArray[np.bool_], frame: Voxels, threads: int | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the keys (n,) of the voxels of points in the blocks `near`, and how many they hold."""
+
+    def count(share):
+        some = _share(points, share)
+        keys, counts = np.empty((2, len(some.x)), np.int64)
+        number = _keys(some, frame, near, keys, counts)
+        return _sum_by_key(keys[:number], counts[:number])
+
+    parts = list(map_blocks(count, _slices(len(points.x)), threads))
+    return _sum_by_key(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _sum_by_key(
+    keys: NDArray[np.int64], counts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return each key once, ascending, and the sums of its counts."""
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(begins_run(keys))
+    return keys[starts], np.add.reduceat(counts[order], starts) if len(keys) else counts
+
+
+@device
+def _key(x, y, z, frame):
+    """Return the key of the voxel that a point lies in."""
+    row, column = np.floor(y / frame.side), np.floor(x / frame.side)
+    place = (np.int64(row) - frame.bottom) * frame.width + np.int64(column) - frame.left
+    layer = max(min(np.floor(z / frame.height), LAYERS - 8.0), 8.0 - LAYERS)
+    return (place << BITS) + np.int64(layer) + LAYERS
+
+
+@njit
+def _keys(points, frame, near, keys, counts):
+    """Write the voxels of points in the blocks `near`; return how many.
+
+    Points that follow one another in a file are often of one voxel, which is written once.
+    """
+    number = 0
+    for k in range(len(points.x)):
+        if near[points.block[k]]:
+            key = _key(points.x[k], points.y[k], points.z[k], frame)
+            if number > 0 and keys[number - 1] == key:
+                counts[number - 1] += 1
+            else:
+                keys[number], counts[number] = key, 1
+                number += 1
+    return number
+
+
+@njit
+def _assign(points, state, frame, wanted, detached, keys, found):
+    """Give the points in wanted blocks the states of their voxels.
+
+    `detached` (m,) says which columns have any that are not solid.
+    """
+    for k in range(len(points.x)):
+        if wanted[points.block[k]]:
+            key = _key(points.x[k], points.y[k], points.z[k], frame)
+            if detached[key >> BITS]:
+                state[k] = found[np.searchsorted(keys, key)]
+
+
+def _judge(keys, counts, most, frame: Voxels, threads: int | None) -> NDArray[np.uint8]:
+    """Return the states (n,) of voxels; `most` (h, w) are points of a cluster in each block."""
+    number = len(keys)
+    bounds = np.linspace(0, number, number // SHARE + 2).astype(np.int64)
+    spans = list(itertools.pairwise(bounds.tolist()))
+    around, parent = np.empty(number, np.bool_), np.arange(number)
+
+    def sum_points(span):
+        _fill(keys, counts, frame.width, *span, RULES, around)
+
+    def join(span):
+        _join(keys, around, frame.width, *span, span[1], parent)
+
+    for work in (sum_points, join):
+        for _ in map_blocks(work, spans, threads):
+            pass
+    last_row = (frame.width + 2) << BITS
+    for _, end in spans[:-1]:  # what touches across the end of a span
+        begin = np.searchsorted(keys, keys[end] - last_row)
+        _join(keys, around, frame.width, begin, end, number, parent)
+    solid = np.empty(number, np.bool_)
+    _mark_solid(keys, counts, around, parent, most, frame, RULES, solid)
+    state = np.where(solid, np.uint8(SOLID), np.uint8(LOOSE))
+
+    def hold(span):
+        _hold(keys, solid, frame, *span, RULES, state)
+
+    for _ in map_blocks(hold, spans, threads):
+        pass
+    return state
+
+
+@njit
+def _fill(keys, counts, width, begin, end, rules, full):
+    """Find the voxels of a span with enough points in them and in the 26 around."""
+    total, voxels = np.zeros((2, end - begin), np.int64)
+    for j in range(-1, 2):
+        for i in range(-1, 2):
+            offset = (j * width + i) << BITS
+            start = np.searchsorted(keys, keys[begin] + offset - 1)
+            for k in range(begin, end):
+                at = keys[k] + offset
+                while start < len(keys) and keys[start] < at - 1:
+                    start += 1
+                other = start
+                while other < len(keys) and keys[other] <= at + 1:
+                    total[k - begin] += counts[other]
+                    voxels[k - begin] += 1
+                    other += 1
+    for k in range(begin, end):
+        few = voxels[k - begin] <= rules.max_line_voxels
+        least = rules.min_around if few else rules.min_mean * voxels[k - begin]
+        full[k] = total[k - begin] >= least
+
+
+@njit
+def _join(keys, full, width, begin, end, stop, parent):
+    """Join the full voxels of a span with those that touch them, above and ahead, up to `stop`."""
+    for j, i in ((0, 0), (0, 1), (1, -1), (1, 0), (1, 1)):
+        offset = (j * width + i) << BITS
+        first = 1 if offset == 0 else -1
+        start = np.searchsorted(keys, keys[begin] + offset + first)
+        for k in range(begin, end):
+            at = keys[k] + offset
+            while start < stop and keys[start] < at + first:
+                start += 1
+            other = start
+            while other < stop and keys[other] <= at + 1:
+                if full[k] and full[other]:
+                    a, b = root_of(parent, k), root_of(parent, other)
+                    parent[max(a, b)] = min(a, b)
+                other += 1
+
+
+@njit
+def _mark_solid(keys, counts, full, parent, most, frame, rules, solid):
+    """Find the voxels of components that are large, or long and thin."""
+    number, label = 0, np.full(len(keys), -1)
+    for k in range(len(keys)):
+        if full[k]:
+            root = root_of(parent, k)  # the first of its component
+            label[k] = number if root == k else label[root]
+            number += root == k
+    size, first = np.zeros(number, np.int64), np.full(number, -1)
+    low, high = np.zeros((number, 3), np.int64), np.zeros((number, 3), np.int64)
+    sums = np.zeros((number, 6), np.int64)
+    for k in range(len(keys)):
+        if full[k]:
+            n = label[k]
+            if first[n] < 0:
+                first[n] = k
+            size[n] += counts[k]
+            _extend(keys[first[n]], keys[k], frame.width, low[n], high[n], sums[n])
+    big = np.empty(number, np.bool_)
+    for n in range(number):
+        row, column = divmod(keys[first[n]] >> BITS, frame.width)
+        j = int((row - rules.hold_columns) * frame.side / BLOCK_M)
+        i = int((column - rules.hold_columns) * frame.side / BLOCK_M)
+        flat = max(high[n, 0] - low[n, 0], high[n, 1] - low[n, 1])
+        rise = (high[n, 2] - low[n, 2]) * frame.height
+        longest = max(rules.extent_sides * frame.side, rules.extent_m)
+        big[n] = size[n] > most[j, i] or max((flat + 1) * frame.side, rise) > longest
+        long = flat + 1 >= rules.line_columns and (flat + 1) * frame.side >= rules.line_m
+        big[n] |= long and _is_line(sums[n], rise / (flat * frame.side), rules)
+    for k in range(len(keys)):
+        solid[k] = full[k] and big[label[k]]
+
+
+@device
+def _extend(first, key, width, low, high, sums):
+    """Add a voxel to the extents and sums of its component, from the component's first voxel."""
+    j, i = divmod(key >> BITS, width)
+    first_j, first_i = divmod(first >> BITS, width)
+    j, i = j - first_j, i - first_i
+    layer = (key & ((1 << BITS) - 1)) - (first & ((1 << BITS) - 1))
+    for axis, at in ((0, j), (1, i), (2, layer)):
+        low[axis], high[axis] = min(low[axis], at), max(high[axis], at)
+    for axis, value in ((0, 1), (1, j), (2, i), (3, j * j), (4, i * i), (5, j * i)):
+        sums[axis] += value
+
+
+@device
+def _is_line(sums, slope, rules):
+    """Tell whether voxels lie along a line that rises little, by the sums of :func:`_extend`."""
+    n, j, i = sums[0], sums[1] / sums[0], sums[2] / sums[0]
+    jj, ii, ji = sums[3] / n - j * j, sums[4] / n - i * i, sums[5] / n - j * i
+    across = (jj + ii) / 2 - np.sqrt(((jj - ii) / 2) ** 2 + ji * ji)
+    return across <= rules.line_variance and slope <= rules.line_slope
+
+
+@njit
+def _hold(keys, solid, frame, begin, end, rules, state):
+    """Mark what is detached and has something solid close, as far up and down as a side."""
+    layers = int(np.ceil(rules.hold_sides * frame.side / frame.height))
+    for k in range(begin, end):
+        if solid[k]:
+            continue
+        for j in range(-rules.hold_columns, rules.hold_columns + 1):
+            for i in range(-rules.hold_columns, rules.hold_columns + 1):
+                at = keys[k] + ((j * frame.width + i) << BITS)
+                other = np.searchsorted(keys, at - layers)
+                while other < len(keys) and keys[other] <= at + layers:
+                    if solid[other]:
+                        state[k] = HELD
+                    other += 1
