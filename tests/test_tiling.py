@@ -366,8 +366,8 @@ def test_global_stages_are_refused(tmp_path, town_file, stage, message):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"tile": 0}, "above 0"),
-        ({"tile": 1e300}, "--tile must be a number above 0 and at most 1e"),
+        ({"tile": 0}, "from 0.001"),
+        ({"tile": 1e300}, "--tile must be a number from 0.001 to 1e"),
         ({"workers": 10_000}, "cores"),
         ({"workers": 1, "scheduler": "tcp://x:1"}, "one of them"),
         ({"per": "day"}, "one of"),
