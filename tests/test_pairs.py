@@ -19,6 +19,7 @@ import pdal_stages as ps
 from pdal_stages.classifier.model import load_model
 from pdal_stages.classifier.model_file import find
 from pdal_stages.cli import main
+from pdal_stages.pipeline import pdal as pdal_env
 
 allpairs = pytest.importorskip("allpairspy").AllPairs
 
@@ -193,7 +194,11 @@ def test_row(number, request, scenes, models, tmp_path, capfd):
     row = dict(zip(VALUES, ROWS[number], strict=True))
     files, model = scenes[row["input"]], models[row["model"]]
     command = command_of(row, files, model, tmp_path)
-    assert main(command) == 0, capfd.readouterr().err
+    code, said = main(command), capfd.readouterr().err
+    if code and not pdal_env.splits_class_flags():  # flags of old files, through PDAL
+        assert "as parts of the class" in said and not [*tmp_path.glob("o*")]
+        return
+    assert code == 0, said
     outputs = sorted(tmp_path.glob("o*"))
     if row["tiles"] == "resumed":
         before = outputs[0].read_bytes()

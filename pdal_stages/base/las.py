@@ -1,13 +1,13 @@
 """Headers and records of LAS and LAZ files (LAS 1.4 R15).
 
-Not laspy's reader: its import takes 0.15 CPU seconds of every start, and it reads all records
-before their sizes are checked.
+Their points: :mod:`.las_points`. Copies with other classes: :mod:`.las_copy`. Not laspy's reader:
+its import takes 0.15 CPU seconds of every start, and it reads all records before their sizes are
+checked.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import struct
 from collections.abc import Iterator
@@ -109,6 +109,12 @@ def source_id(path: str | os.PathLike) -> int:
     return int.from_bytes(head[4:6], "little") if head[25:] > b"\0" else 0
 
 
+def end_of_points(header: LasHeader, size: int) -> int:
+    """Return the end of the point data: the offset of what follows, or the size of the file."""
+    places = [header.after] * bool(header.records_after) + [header.waveforms]
+    return min([size, *(place for place in places if place >= header.offset)])
+
+
 class Record(NamedTuple):
     """A variable-length record."""
 
@@ -207,6 +213,17 @@ def supersede_copc(path: str | os.PathLike) -> None:
             file.write(b"LASF_Spec".ljust(16, b"\0") + struct.pack("<H", 7))
 
 
+#: User id of the records of the reference system.
+PROJECTION = b"LASF_Projection"
+
+
+def says_wkt(path: str | os.PathLike) -> bool:
+    """Return whether the header of a LAS file says that its reference is well-known text."""
+    with open(path, "rb") as file:
+        head = file.read(8)
+    return bool(head[6:7] and head[6] & 16)
+
+
 def projection_digest(path: str | os.PathLike) -> str:
     """Return a digest of the records that hold a file's spatial reference; empty without any.
 
@@ -215,44 +232,10 @@ def projection_digest(path: str | os.PathLike) -> str:
     OSError
         If the file cannot be read.
     """
-    held = records_of(path, b"LASF_Projection")
+    held = records_of(path, PROJECTION)
     parts = [struct.pack("<HQ", record.number, record.length) + data for record, data in held]
-    return hashlib.sha256(b"".join(parts)).hexdigest()[:16] if parts else ""
-
-
-# Numbers of GeoTIFF keys.
-_MODEL_TYPE = 1024  #: type of the model, 1 for projected
-_ANGULAR_UNIT = 2054
-_PLANE_UNIT = 3076  #: unit of x and y
-#: EPSG's codes of units by their length in meters.
-_UNIT_CODES = {1.0: 9001, 0.3048: 9002, 1200 / 3937: 9003}
-
-
-def set_geotiff_unit(path: str | os.PathLike, unit: float) -> None:
-    """Set the unit of x and y in the GeoTIFF keys of a LAS file, in place, where they name one.
-
-    GDAL writes the unit of z there where the two differ, and of a plane without a projection it
-    leaves out the model's type, without which the unit of z is not read. `unit` is a length in
-    meters; one without a code of EPSG's changes nothing.
-    """
-    code = next((c for length, c in _UNIT_CODES.items() if math.isclose(length, unit)), None)
-    header = read_header(path)
-    if code is None or header is None:
-        return
-    with open(path, "r+b") as file:
-        for record in islice(records(file, header), _MOST_RECORDS):
-            if (record.user, record.number) != (b"LASF_Projection", 34735):
-                continue
-            file.seek(record.data + 8)
-            data = file.read(min(record.length, LARGEST_RECORD) - 8)
-            keys = {row[0]: row for row in struct.iter_unpack("<4H", data[: len(data) // 8 * 8])}
-            if keys.get(_PLANE_UNIT, ())[1:] not in ((0, 1, c) for c in _UNIT_CODES.values()):
-                continue
-            keys[_PLANE_UNIT] = (_PLANE_UNIT, 0, 1, code)
-            if _MODEL_TYPE not in keys and keys.pop(_ANGULAR_UNIT, ()):  # its row gets free
-                keys[_MODEL_TYPE] = (_MODEL_TYPE, 0, 1, 1)
-            file.seek(record.data + 8)
-            file.write(b"".join(struct.pack("<4H", *keys[key]) for key in sorted(keys)))
+    flag = bytes([says_wkt(path)])
+    return hashlib.sha256(flag + b"".join(parts)).hexdigest()[:16] if parts else ""
 
 
 def number_type(kind: str) -> np.dtype:

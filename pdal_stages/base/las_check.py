@@ -24,15 +24,15 @@ from .files import disk_is_full
 from .las import (
     POINT_BYTES,
     POINTWISE,
-    WAVES,
     LasHeader,
     chunk_table,
+    end_of_points,
     laszip_record,
     read_header,
     records,
     records_of,
 )
-from .las_repair import ExtraField, description, fields_of
+from .las_points import Layout
 
 #: What to do about a damaged file.
 CURE_OF_DAMAGE = (
@@ -62,8 +62,7 @@ def check_readable(path: str | os.PathLike) -> str | None:
     Raises
     ------
     StageError
-        If the file is damaged or cannot be opened, where PDAL says little or crashes; or if no
-        PDAL reads its point format.
+        If the file is damaged or cannot be opened, where PDAL says little or crashes.
     """
     where = str(path)
     try:
@@ -75,7 +74,8 @@ def check_readable(path: str | os.PathLike) -> str | None:
             problem = _header_problem(header, size) or _record_problem(file, header, size)
             check = _chunk_problem if header.compressed else _count_problem
             problem = problem or check(file, header, size)
-        fields = [] if problem else fields_of(header, description(path))[0]
+        if not problem:
+            Layout.of(path)  # whose extra bytes must fit
     except OSError as error:
         raise StageError("the file cannot be read", where=where, found=error) from None
     except StageError as error:
@@ -87,21 +87,13 @@ def check_readable(path: str | os.PathLike) -> str | None:
             found=problem[1],
             cure=CURE_OF_DAMAGE,
         )
-    if plain_format := WAVES.get(header.point_format):
-        raise StageError(
-            "PDAL does not read points with waveforms",
-            where=where,
-            found=f"point format {header.point_format}",
-            cure=f"Convert the file to format {plain_format}, which has everything but the "
-            f"waveforms: laspy.convert(laspy.read(IN), point_format_id={plain_format}).write(OUT)",
-        )
-    warning = _describe_oddity(header, size, fields)
+    warning = _describe_oddity(header, size)
     return warning and f"{path}: {warning}"
 
 
-def _describe_oddity(header: LasHeader, size: int, fields: list[ExtraField]) -> str | None:
+def _describe_oddity(header: LasHeader, size: int) -> str | None:
     """Return a warning about a file that can be read but is unusual."""
-    beyond = _end_of_points(header, size) - header.offset - header.count * header.point_bytes
+    beyond = end_of_points(header, size) - header.offset - header.count * header.point_bytes
     if not header.compressed and beyond >= header.point_bytes:
         return (
             f"the file holds {beyond:,} bytes beyond the {header.count:,} points that its header "
@@ -111,11 +103,6 @@ def _describe_oddity(header: LasHeader, size: int, fields: list[ExtraField]) -> 
         return (
             "the bounding box in its header is all zeros, as when a program was stopped while "
             "writing it; check that the points lie where they should"
-        )
-    if clashing := [f"{field.title} as {field.name}" for field in fields if field.clashes]:
-        return (
-            "extra bytes named like other dimensions are read and written under other names: "
-            + ", ".join(clashing)
         )
     return None
 
@@ -195,12 +182,6 @@ def _is_whole(path: Path, count: int | None) -> bool:
     return header is not None and count in (None, header.count)
 
 
-def _end_of_points(header: LasHeader, size: int) -> int:
-    """Return the end of the point data: the offset of what follows, or the size of the file."""
-    places = [header.after] * bool(header.records_after) + [header.waveforms]
-    return min([size, *(place for place in places if place >= header.offset)])
-
-
 def _header_problem(header: LasHeader, size: int) -> Problem | None:
     """Return a problem of the header itself."""
     h = header
@@ -247,7 +228,7 @@ def _record_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | N
 
 def _count_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | None:
     """Return a problem of the number of uncompressed points."""
-    held = max(0, _end_of_points(header, size) - header.offset) // header.point_bytes
+    held = max(0, end_of_points(header, size) - header.offset) // header.point_bytes
     if held < header.count:
         return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
     return _uncounted(held * header.point_bytes) if held and not header.count else None
@@ -273,7 +254,7 @@ def _chunk_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | No
     (_, table), begin = chunk_table(file, header), header.offset + 8
     inside = begin <= table <= size - 8
     if not header.count:  # an empty file may have 8 bytes
-        end = table - 8 if inside else _end_of_points(header, size)
+        end = table - 8 if inside else end_of_points(header, size)
         return _uncounted(end - begin) if end > begin else None
     if not inside:
         return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"

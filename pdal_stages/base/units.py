@@ -280,6 +280,14 @@ class WktNode:
         return ":".join(codes[-1]) if codes else ""
 
 
+#: Keywords of reference systems, in WKT 1 and 2.
+SYSTEMS = frozenset(
+    (
+        *("PROJCS", "PROJCRS", "PROJECTEDCRS", "COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "LOCAL_CS"),
+        *("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"),
+        *("ENGCRS", "ENGINEERINGCRS", "DERIVEDPROJCRS", "VERT_CS", "VERTCRS", "VERTICALCRS"),
+    )
+)
 #: Deeper text is not well-known text.
 _DEEPEST = 100
 _TOKEN = re.compile(r'\s*(?:"((?:[^"]|"")*)"|([\w.+-]+)|([\[(])|([\])])|,)')

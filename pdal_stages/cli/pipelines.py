@@ -63,7 +63,7 @@ def _input(add: Callable) -> None:
     add("-s", "--stdin", action="store_true", help="Read the pipeline from standard input")
 
 
-def _build(options: argparse.Namespace, whole: bool = True) -> Pipeline:
+def _build(options: argparse.Namespace) -> Pipeline:
     """Return the pipeline of a file or of standard input, with its overrides."""
     from ..pipeline.json_source import decode, parse_pipeline
     from ..pipeline.run import Pipeline
@@ -76,7 +76,7 @@ def _build(options: argparse.Namespace, whole: bool = True) -> Pipeline:
     elif not source.name:
         usage = f"Usage: pdal-stages {options.command} job.json"
         raise StageError("no pipeline file was given", cure=usage)
-    return Pipeline(source, options.overrides, whole=whole)
+    return Pipeline(source, options.overrides)
 
 
 def _pipeline(options: argparse.Namespace) -> int:
@@ -111,7 +111,7 @@ def _run_tiles(options: argparse.Namespace) -> int:
     from ..tiling.tiled_run import run_tiled
 
     tiling, files = tiling_options(options), run_files(options)
-    pipeline = _build(options, whole=False)
+    pipeline = _build(options)
     if options.validate:
         make_plan(pipeline, tiling.buffer)
         print(pipeline.validate())

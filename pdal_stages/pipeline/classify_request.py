@@ -10,16 +10,15 @@ from typing import Any
 
 from ..base.asprs import OVERLAP, TERRAIN
 from ..base.errors import ModelError, OptionError, suggest
-from ..base.las_repair import extra_dimensions
 from ..base.selections import split_selection
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..stages import preprocessing
 from ..stages.points import SELECTED
 from ..stages.registry import stage_from, stage_types
-from .inputs_outputs import is_las, writes_las
+from ..stages.where_expression import Expression
+from .inputs_outputs import writes_las
 from .json_source import Override, overridden
-from .las_files import extra_dims_option
 from .pdal import reader_of, writer_of
 from .run import Pipeline
 
@@ -27,12 +26,6 @@ from .run import Pipeline
 _GROUND = preprocessing.GROUND_FILTER
 #: Dimensions that are written besides the input's own by default.
 WRITTEN = ("HeightAboveGround", "Reliability")
-#: Prefix of dimensions that hold what the input has, while stages create others of the same names.
-_KEPT = "PdalStagesKept"
-
-
-def _ferry(pairs: list[str]) -> list[dict[str, Any]]:
-    return [{"type": "filters.ferry", "dimensions": ",".join(pairs)}] if pairs else []
 
 
 @dataclass(frozen=True)
@@ -53,6 +46,11 @@ class ClassifyRequest:
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     given_ground: bool = False  #: points of the classes TERRAIN are the ground, and stay so
 
+    @property
+    def _inside(self) -> dict[str, Any]:
+        """The condition of stages: points that were marked as they came in, before any stage."""
+        return {"where": f"{SELECTED} == 1"} if self.where else {}
+
     @cached_property
     def _classifier(self) -> dict[str, Any]:
         """The classifier as an object of a pipeline, before overrides."""
@@ -60,7 +58,7 @@ class ClassifyRequest:
             "type": "filters.modelclassifier",
             "model": self.model,
             "compact": True,
-            **({"where": self.where, "mark": SELECTED} if self.where else {}),
+            **self._inside,
             **self.classifier_options,
         }
         for option, prefix in (("margin", "Margin"), ("probabilities", "Probability_")):
@@ -97,13 +95,13 @@ class ClassifyRequest:
                 cure="Write a pipeline: the reader, these stages with the options of the training, "
                 "filters.modelclassifier, and the writer",
             )
+        if self.where:
+            Expression(self.where)  # which refuses what it cannot read
         prepared, keep_ground = self._prepared()
-        noise: dict[str, Any] = {"type": "filters.detachednoise"}
-        where, others = self.where, " && ".join(f"Classification != {c}" for c in TERRAIN)
+        noise: dict[str, Any] = {"type": "filters.detachednoise", **self._inside}
         if keep_ground:
-            where = f"({where}) && {others}" if where else others
-        if where:
-            noise["where"] = where
+            others = " && ".join(f"Classification != {code}" for code in TERRAIN)
+            noise["where"] = f"{noise['where']} && {others}" if self.where else others
         classifier = {**self._classifier, **({"given_ground": True} if keep_ground else {})}
         first = [noise] if self.noise else []
         return [*first, *prepared, classifier, *self._corrections(keep_ground)]
@@ -129,10 +127,7 @@ class ClassifyRequest:
         return stages, any(stage.get("given_ground") for stage in stages)
 
     def _corrections(self, keep_ground: bool) -> list[dict[str, Any]]:
-        """Return the stages after the classifier that were requested, polygons last.
-
-        They take the points that the classifier marked: `where` would see its new classes by then.
-        """
+        """Return the stages after the classifier that were requested, polygons last."""
         settled = self._settled
         shared: dict[str, Any] = {
             name: settled[name] for name in ("ignore", "keep") if name in settled
@@ -149,11 +144,10 @@ class ClassifyRequest:
         if self.polygons:
             polygons = {"type": "filters.polygons", "polygons": list(self.polygons)}
             stages.append({**polygons, **shared})
-        inside = {"where": f"{SELECTED} == 1"} if self.where else {}
-        return [{**stage, **inside} for stage in stages]
+        return [{**stage, **self._inside} for stage in stages]
 
     @cached_property
-    def _creates(self) -> dict[str, str]:
+    def creates(self) -> dict[str, str]:
         """The dimensions that the stages create, except classes: name -> PDAL type."""
         created: dict[str, str] = {}
         for stage in self.stages:
@@ -161,14 +155,13 @@ class ClassifyRequest:
                 created["HeightAboveGround"] = "double"
             elif stage["type"] in stage_types():
                 created |= stage_from(overridden(stage, self.overrides)).creates()
-        for name in ("Classification", SELECTED):
-            created.pop(name, None)
+        created.pop("Classification", None)
         return created
 
     @cached_property
     def extra_dims(self) -> dict[str, str]:
         """The dimensions that are written besides the input's own: name -> PDAL type."""
-        created = self._creates
+        created = self.creates
         for name in self.dimensions:
             if name not in ("all", "none", *created) and self.dimensions != WRITTEN:
                 raise OptionError(
@@ -180,8 +173,8 @@ class ClassifyRequest:
         every = "all" in self.dimensions
         return {name: kind for name, kind in created.items() if every or name in self.dimensions}
 
-    def pipeline(self, source: str, target: str) -> Pipeline:
-        """Return the pipeline that classifies one file; everything else in it is kept."""
+    def writer(self, target: str) -> dict[str, Any]:
+        """Return the writer of an output; OptionError for files that `classify` does not write."""
         if Path(target).suffix.lower() in (".tif", ".tiff", ".gpkg", ".shp", ".geojson"):
             raise OptionError(
                 "classify writes points",
@@ -190,20 +183,26 @@ class ClassifyRequest:
                 "rasters: docs/large-areas.md",
             )
         writer = writer_of(target)
-        to_las = "type" in writer and writes_las(writer)  # other formats get all dimensions
-        if to_las:
-            listed = extra_dims_option([source], self.extra_dims)
-            writer |= {"extra_dims": listed} if listed else {}
-        elif self.dimensions != WRITTEN and "all" not in self.dimensions:
+        to_las = "type" in writer and writes_las(writer)
+        if not to_las and self.dimensions != WRITTEN and "all" not in self.dimensions:
             raise OptionError(
                 "--dimensions is for LAS and LAZ; other formats get all dimensions",
                 found=target,
                 cure="Leave it out, or write a pipeline",
             )
-        # What stages create on the way must not replace what the input has under the same name.
-        existing = extra_dimensions(source) if to_las and is_las(source) else {}
-        kept = [name for name in existing if name in self._creates and name not in self.extra_dims]
-        keep = _ferry([f"{name}=>{_KEPT}{name}" for name in kept])
-        restore = _ferry([f"{_KEPT}{name}=>{name}" for name in kept])
-        stages = [reader_of(source, "input"), *keep, *self.stages, *restore, writer]
-        return Pipeline(stages, self.overrides)
+        return writer
+
+    def pipeline(self, source: str, target: str) -> Pipeline:
+        """Return the pipeline that classifies one file; everything else in it is kept."""
+        stages = [reader_of(source, "input"), *self.stages, self.writer(target)]
+        pipeline = Pipeline(stages, self.overrides, may_copy=True)
+        for stage, name in zip(
+            pipeline.source.stages[:: len(stages) - 1], (source, target), strict=True
+        ):
+            if str(stage.get("filename")) != name:
+                raise OptionError(
+                    "classify names its files itself",
+                    found=f"{stage['type']}.filename={stage.get('filename')}",
+                    cure="Give the files as arguments: pdal-stages classify INPUT OUTPUT",
+                )
+        return pipeline

@@ -15,22 +15,16 @@ from typing import Any
 
 from ..base.dimensions import known
 from ..base.errors import DimensionError, PipelineError, StageError
-from ..base.las_repair import extra_dimensions
+from ..base.las_points import layout_there
 from ..classifier.model_file import find
 from ..features.registry import BY_NAME
 from ..stages import preprocessing
 from ..stages.base import Stage
 from ..stages.points import MAKERS
 from ..stages.registry import PDAL_OWN, stage_from, stage_type, stage_types
-from . import pdal as pdal_env
 from .inputs_outputs import is_reader, readers_files
 from .json_source import PipelineSource
-from .las_files import (
-    check_copc_outputs,
-    check_las_limits,
-    files_with_flags_to_split,
-    flag_splitter,
-)
+from .pdal_facts import check_copc_outputs, check_outputs
 from .runtime import BY_LABEL, TRAMPOLINE, ExpandedStage, python_filter
 from .spatial_reference import fault_of_reference
 
@@ -51,27 +45,24 @@ class Expanded:
 
 
 def expand(
-    source: PipelineSource, whole: bool = True, ready: Sequence[ExpandedStage] = ()
+    source: PipelineSource, ready: Sequence[ExpandedStage] = (), copied: bool = False
 ) -> Expanded:
     """Expand a pipeline.
 
-    Not `whole`: it will be run in tiles, which separate flags from classes themselves. `ready` are
-    its stages of ours, in order, where an earlier pipeline with the same stages has made them.
+    `ready` are its stages of ours, in order, where an earlier pipeline with the same stages has
+    made them. `copied`: its output is a copy of the input, without PDAL.
     """
     stages = copy.deepcopy(source.stages)
     places = [source.where(number) for number in range(len(stages))]
     _refuse_several_ends(stages, places)
     check_copc_outputs(stages)
     out = Expanded([])
-    flags = _flags_to_split(stages) if whole else []
     readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
     names = [str(stages[number].get("filename", "")) for number in readers]
     several = len(readers) > 1 or any(c in name for name in names for c in "*?[")
     for index, stage in enumerate(stages):
         if stage["type"] not in stage_types():
-            out.stages += _reader_per_file(stage) if flags and is_reader(stage) else [stage]
-            if flags and index == readers[-1]:
-                out.stages.append(flag_splitter(flags))
+            out.stages.append(stage)
             continue
         try:
             if _may_be_apart(stages, index, several):
@@ -93,30 +84,8 @@ def expand(
         out.stages.append(expanded.plain)
     if not ready:
         _place_upstream(out)
-    check_las_limits(out.stages, out.ours)
+    check_outputs(out.stages, out.ours, copied)
     return out
-
-
-def _reader_per_file(reader: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a reader for each file of a pattern, by name: PDAL reads in the folder's order."""
-    names = readers_files([reader])
-    untagged = {name: value for name, value in reader.items() if name != "tag"}
-    return [{**untagged, "filename": name} for name in names] if len(names) > 1 else [reader]
-
-
-def _flags_to_split(stages: list[dict[str, Any]]) -> list[bool]:
-    """Return for each input file whether flags must be split from the class; empty for none."""
-    with_ours = any(stage["type"] in stage_types() for stage in stages)
-    flags = files_with_flags_to_split(stages, with_ours)
-    readers = [number for number, stage in enumerate(stages) if is_reader(stage)]
-    if flags and (readers[-1] >= len(readers) or any("inputs" in stage for stage in stages)):
-        raise PipelineError(
-            "this PDAL carries the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 into "
-            "other files only where all readers come first and no stage has 'inputs'",
-            found=f"PDAL {pdal_env.dotted_version()}",
-            cure="Leave 'inputs' out, write one file at a time, or use PDAL 2.6",
-        )
-    return flags
 
 
 # ---- how PDAL wires stages -----------------------------------------------------------------------
@@ -262,7 +231,8 @@ def _may_create(name: str, stage: Mapping[str, Any]) -> bool:
     if is_reader(stage):
         files = readers_files([stage], las=True)
         named = name in str(stage.get("extra_dims", ""))
-        return not files or named or any(name in extra_dimensions(path) for path in files)
+        layouts = filter(None, map(layout_there, files))
+        return not files or named or any(name in layout.own for layout in layouts)
     if stage["type"] in _CREATES_ANY or name in heights_of(stage):
         return True
     return any(name in str(value) for key, value in stage.items() if key not in ("type", "tag"))

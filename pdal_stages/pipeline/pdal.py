@@ -7,7 +7,6 @@ python-pdal's classes, ``plugin/install.py`` looks for PDAL's library and header
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import logging
@@ -17,7 +16,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -26,10 +24,9 @@ from types import CodeType, FrameType
 from typing import Any, TypeVar
 
 from ..base.errors import DependencyError, PipelineError
-from ..base.las import header_there, named_copc, named_las, source_id
+from ..base.las import named_copc, named_las, source_id
 from ..base.las_check import CURE_OF_DAMAGE, check_readable
-from ..base.las_repair import corrected, overwritten
-from .inputs_outputs import readers_files, writers_outputs
+from .inputs_outputs import readers_files
 
 INSTALL = (
     "Install PDAL with its Python bindings and its program 'pdal' on PATH: conda install -c "
@@ -173,48 +170,8 @@ def execute(
     """
     for path in readers_files(stages, las=True):
         check_readable(path)  # newer PDAL crashes on a LAZ file that is cut short
-    with _one_run, readable(stages) as copies:
-        return _execute(copies, arrays, loglevel)
-
-
-@contextlib.contextmanager
-def readable(stages: list[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
-    """Yield the stages with corrected copies in place of LAS files that PDAL cannot read.
-
-    See :mod:`..base.las_repair`. The copies lie beside what is written, and are removed on leaving.
-    """
-    beside = [os.path.dirname(output.path) for output in writers_outputs(stages)][:1]
-    folder = next(filter(os.path.isdir, beside), None)
-    with contextlib.ExitStack() as stack:
-        out: list[dict[str, Any]] = []
-        for stage in stages:
-            paths = readers_files([stage], las=True)
-            reads_extra = not stage.keys() & {"extra_dims", "ignore_vlr"}
-            by_request = str(stage.get("use_eb_vlr", "")).lower() == "true"
-            streams = []
-            for path in paths:
-                header = header_there(path)
-                described = by_request or (header is not None and header.minor >= 4)
-                streams.append(corrected(path, reads_extra and described))
-            if any(streams):
-                copies = tempfile.TemporaryDirectory(prefix=".pdal-stages-input-", dir=folder)
-                name = _copy_corrected(stack.enter_context(copies), paths, streams)
-                stage = {**stage, "filename": name}
-            out.append(stage)
-        yield out
-
-
-def _copy_corrected(folder: str, paths: list[str], streams: Sequence[Any]) -> str:
-    """Copy corrected files into a folder, with links to others; return a pattern of all."""
-    for number, (path, stream) in enumerate(zip(paths, streams, strict=True)):
-        suffix = ".laz" if path.lower().endswith("z") else ".las"
-        name = os.path.join(folder, f"{number:06}{suffix}")
-        if stream is None:
-            os.symlink(os.path.abspath(path), name)
-            continue
-        with stream, open(name, "xb") as copy:
-            shutil.copyfileobj(stream, copy, 1 << 20)
-    return name if len(paths) == 1 else os.path.join(folder, "*")
+    with _one_run:
+        return _execute(stages, arrays, loglevel)
 
 
 #: PDAL puts its log in the place of sys.stdout while it runs and restores what it replaced, which
@@ -280,9 +237,8 @@ def _log(pipeline: Any) -> str:
 
 def validate(stages: list[dict[str, Any]]) -> None:
     """Let the program `pdal` check stages and their options, without reading points."""
-    with readable(stages) as copies:
-        text = json.dumps({"pipeline": for_this_version(copies)})
-        done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
+    text = json.dumps({"pipeline": for_this_version(stages)})
+    done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
     output = (done.stderr or done.stdout).strip()
     verdict = {"valid": done.returncode == 0, "error_detail": output}
     with contextlib.suppress(ValueError):
@@ -291,6 +247,15 @@ def validate(stages: list[dict[str, Any]]) -> None:
         raise translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
 
 
+FLAGS_IN_CLASSES = (
+    "this PDAL reads the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 as parts of the "
+    "class, and would make other classes of them here"
+)
+FLAGS_CURE = (
+    "Convert it first: laspy.convert(laspy.read(IN), point_format_id=6).write(OUT), 7 with colors; "
+    "or keep it LAS 1.2 and apart from those of LAS 1.4; or use PDAL 2.6. pdal-stages classify "
+    "needs none of this where it writes no other format"
+)
 BROKEN_REFERENCE = "the spatial reference in the file cannot be read"
 REFERENCE_CURE = (
     "Name the right one, --readers.las.override_srs=EPSG:CODE "
@@ -320,6 +285,9 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         return PipelineError(what, found=one_line, cure=CURE_OF_DAMAGE)
     if "convert spatial reference" in text:
         return PipelineError(BROKEN_REFERENCE, found=one_line, cure=REFERENCE_CURE)
+    if "dimension with invalid name" in text:
+        cure = "Run it with pdal-stages classify, which takes names as they are"
+        return PipelineError("PDAL refuses the name of a dimension", found=one_line, cure=cure)
     if "Traceback (most recent call last)" in text:  # of a script; a list in older PDAL
         lines = [line.strip(" '") for line in text.replace("\\n", "\n").splitlines()]
         place = [line for line in lines if line.startswith("File ")][-1:]
@@ -447,29 +415,13 @@ def splits_class_flags() -> bool:
     return "Withheld" in {dimension["name"] for dimension in bindings().dimensions}
 
 
-def overwritten_dimensions(metadata: Any) -> list[str]:
-    """Return the dimensions that a reader has overwritten with extra bytes.
-
-    `metadata` is a node, as filters.python has it.
-    """
-    nodes = metadata.get("children", []) if isinstance(metadata, dict) else []
-    values = {node["name"]: node["value"] for node in nodes if isinstance(node, dict)}
-    names = [name for node in nodes for name in overwritten_dimensions(node)]
-    for node in nodes if str(values.get("dataformat_id", "")).isdigit() else ():
-        record = {child["name"]: child["value"] for child in node.get("children", [])}
-        if (record.get("user_id"), str(record.get("record_id"))) == ("LASF_Spec", "4"):
-            data = base64.b64decode(record.get("data", ""))
-            names += overwritten(int(values["dataformat_id"]), data)
-    return names
-
-
 def flags_inside_classification(dimensions: Any, metadata: Any) -> bool:
     """Return whether flag bits of LAS 1.0-1.3 sit inside `Classification`, as before PDAL 2.6.
 
     Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
     """
     flags = ("Synthetic", "KeyPoint", "Withheld", "Overlap", "ClassFlags")
-    return max(_point_formats(metadata), default=6) <= 5 and not any(f in dimensions for f in flags)
+    return max(point_formats(metadata), default=6) <= 5 and not any(f in dimensions for f in flags)
 
 
 def overlap_as_flag(dimensions: Any, metadata: Any) -> bool:
@@ -478,10 +430,10 @@ def overlap_as_flag(dimensions: Any, metadata: Any) -> bool:
     Files of LAS 1.4 have both the class and the flag: there class 0 with the flag is a point not
     yet classified.
     """
-    return "Overlap" in dimensions and min(_point_formats(metadata), default=6) <= 5
+    return "Overlap" in dimensions and min(point_formats(metadata), default=6) <= 5
 
 
-def _point_formats(metadata: Any) -> list[int]:
+def point_formats(metadata: Any) -> list[int]:
     """Return the point data record formats of the files that were read, from PDAL's metadata."""
     return [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
 

@@ -7,19 +7,20 @@ import json
 import logging
 import os
 import re
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections import ChainMap, Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
-from ..base.las import refuse_pipe
+from ..base.las import refuse_pipe, supersede_copc
 from ..base.las_check import check_complete, check_copc, check_ept, check_readable
 from ..base.messages import Report
+from ..base.text_points import check_text
 from ..stages.registry import stage_types
-from . import las_files, runtime
+from . import copies, pdal_facts, runtime
 from . import pdal as pdal_env
 from .expansion import Expanded, check_dimensions, expand, fuse_scripts, stage_files
 from .inputs_outputs import (
@@ -31,9 +32,10 @@ from .inputs_outputs import (
     readers_files,
     with_outputs,
     writers_outputs,
+    writes_las,
 )
 from .json_source import Override, PipelineSource, apply_overrides, read_pipeline
-from .spatial_reference import check_readers, plane_unit
+from .spatial_reference import check_readers
 
 
 class Pipeline:
@@ -45,10 +47,10 @@ class Pipeline:
         A file name, JSON text, the stages themselves, or what :func:`parse_pipeline` made of text.
     overrides : iterable of Override, optional
         Options set from outside (see :mod:`pdal_stages.pipeline.json_source`).
-    whole : bool
-        False: only to be run in tiles.
     ready : sequence of ExpandedStage
         Our stages, in order, where an earlier pipeline with the same stages has made them.
+    may_copy : bool
+        Whether PDAL need not read and write LAS files where it is not needed for them.
 
     Raises
     ------
@@ -68,8 +70,8 @@ class Pipeline:
         source: str | Path | list | dict | PipelineSource,
         overrides: Iterable[Override] = (),
         *,
-        whole: bool = True,
         ready: Sequence[runtime.ExpandedStage] = (),
+        may_copy: bool = False,
     ) -> None:
         read = source if isinstance(source, PipelineSource) else read_pipeline(source)
         overrides = list(overrides)
@@ -77,11 +79,16 @@ class Pipeline:
         stages = apply_overrides(read.stages, [o for o in overrides if o.by_tag])
         stages = apply_overrides(pdal_env.with_types(stages, read.where), overrides)
         self.source = PipelineSource(stages, read.lines, read.name)
-        self.expanded: Expanded = expand(self.source, whole, ready)
+        #: Whether PDAL takes no part: the output is a copy of the input.
+        self.copied = may_copy and self.is_read_here and copies.written_here(stages)
+        self.expanded: Expanded = expand(self.source, ready, self.copied)
         self.metadata: dict[str, Any] = {}
         self.arrays: list = []
         self.log_lines: list[str] = []
         self.warnings: list[str] = []
+        self._where: str | None = None
+        self._sets_scales = may_copy  #: whether LAS files hold what a text has
+        self._unknown: Collection[str] = ()
 
     @property
     def reports(self) -> list[tuple[str, list[Report]]]:
@@ -129,7 +136,7 @@ class Pipeline:
         """Let PDAL check its own stages' options and dimensions, without reading points."""
         stages = self.expanded.stages
         try:
-            self._check_inputs()
+            self.check_inputs()
             # Some of PDAL's writers open their file, and empty it, when they are prepared: they
             # get files in a folder of ours.
             with TemporaryDirectory(prefix="pdal-stages-") as folder:
@@ -168,6 +175,37 @@ class Pipeline:
         files += [name for ours in self.expanded.ours for name in stage_files(ours.stage)]
         return [*files, *filter(None, [self.source.name])]
 
+    @property
+    def is_read_here(self) -> bool:
+        """Return whether it reads LAS files that need no PDAL, and all its filters are ours."""
+        return copies.read_here(self.source.stages)
+
+    def run_here(
+        self,
+        columns: Mapping[str, Any],
+        wkt: str,
+        known: Mapping[str, Any] | None = None,
+        after: Callable[[runtime.ExpandedStage, Mapping[str, Any]], None] | None = None,
+    ) -> ChainMap[str, Any]:
+        """Run its stages without PDAL; see :func:`.copies.run_stages`."""
+        for ours in self.expanded.ours:
+            ours.reports = []
+        seen = copies.run_stages(self.expanded.ours, columns, wkt, known, after)
+        self.metadata = _named_metadata({"metadata": {}}, self.expanded)
+        return seen
+
+    def set_default(self, number: int, **options: Any) -> None:
+        """Set options of one of PDAL's stages that the user has not set."""
+        for name, value in options.items():
+            self.expanded.stages[number].setdefault(name, value)
+
+    def select(self, where: str | None, unknown: Collection[str] = ()) -> None:
+        """Mark the points for which a condition holds, before any stage; see :func:`.selection`.
+
+        `unknown` are dimensions that stages create and the input does not have.
+        """
+        self._where, self._unknown = where, unknown
+
     def execute(self, *, arrays: bool = True, loglevel: int = logging.WARNING) -> int:
         """Run the pipeline in this process; return the number of points that came out.
 
@@ -179,7 +217,7 @@ class Pipeline:
         StageError
             What went wrong, where, and how to fix it.
         """
-        self._check_inputs()
+        self.check_inputs()
         self.check_outputs()
         runtime.remember_stdout()
         for ours in self.expanded.ours:
@@ -187,13 +225,15 @@ class Pipeline:
         callbacks = runtime.Callbacks()
         plain = self.expanded.stages
         stages = callbacks.check_ground(plain)
+        if self._where:
+            first = next(n for n, stage in enumerate(stages) if not is_reader(stage))
+            stages.insert(first, callbacks.select(self._where, self._unknown))
         writers = list(filter(is_writer, plain))
         alone = len(writers) == 1 and writers[0] is plain[-1]
         try:
             result, final_names = execute_whole(
                 fuse_scripts(stages),
                 [output.path for output in writers_outputs(plain)],
-                readers_files(plain, las=True),
                 self._add_missing_reports,
                 counted=alone,
                 arrays=arrays,
@@ -218,8 +258,11 @@ class Pipeline:
             if not ours.reports:
                 ours.reports.append(runtime.run_on_nothing(ours.stage))
 
-    def _check_inputs(self) -> None:
-        """Open all inputs and check headers of LAS files, which PDAL may read as if whole."""
+    def check_inputs(self, pdal: bool = True) -> None:
+        """Open all inputs and check headers of LAS files, which PDAL may read as if whole.
+
+        `pdal`: PDAL will read them.
+        """
         stages = self.expanded.stages
         for path in readers_files(stages):
             try:
@@ -237,14 +280,27 @@ class Pipeline:
         check_dimensions(self.expanded)
         files = readers_files(stages, las=True)
         self.warnings = [*self.expanded.warnings, *filter(None, map(check_readable, files))]
+        if pdal:
+            pdal_facts.check_inputs(stages)
+            pdal_facts.check_units(stages)
+            pdal_facts.check_flags(stages)
         for stage in stages:
-            if stage["type"] == "readers.ept":
+            if stage["type"] == "readers.text":
+                self._check_text(stage)
+            elif stage["type"] == "readers.ept":
                 check_ept(ept_address(str(stage.get("filename", ""))))
             elif stage["type"] == "readers.copc" and pdal_env.knows_copc():
                 for path in readers_files([stage], las=True):
                     check_copc(path)
         if units := [ours.stage.horizontal_unit for ours in self.expanded.ours]:
             self.warnings += check_readers(stages, next(filter(None, units), ""))
+
+    def _check_text(self, reader: Mapping[str, Any]) -> None:
+        """Check a text file; let a writer of LAS hold its coordinates, where no option says how."""
+        for path in readers_files([reader]):
+            held = check_text(path, reader)
+            for stage in filter(writes_las, self.expanded.stages if self._sets_scales else ()):
+                stage.update({k: v for k, v in held.las_options().items() if k not in stage})
 
     def _located(self, error: StageError) -> StageError:
         """Return PDAL's error with the line of the stage that it names, and a similar name."""
@@ -268,7 +324,6 @@ class Pipeline:
 def execute_whole(
     stages: list[dict[str, Any]],
     outputs: Sequence[str],
-    sources: Sequence[str],
     check: Callable[[], None],
     *,
     counted: bool = True,
@@ -281,8 +336,6 @@ def execute_whole(
     stages : list of dict
     outputs : sequence of str
         The final names of the files, in the order of their writers.
-    sources : sequence of str
-        The LAS files that the outputs are made from.
     check : callable
         Called when all is written, before any output gets its name; it may refuse.
     counted : bool
@@ -300,20 +353,15 @@ def execute_whole(
     def finish(partial: Path, final: Path, number: int) -> None:
         every = counted and "where" not in writers[number] and "#" not in outputs[number]
         check_complete(partial, final, writers[number], result.count if every else None)
-        las_files.finish(partial, sources, plane_unit(stages, result.metadata))
+        supersede_copc(partial)
 
     with whole_files(*outputs, check=finish) as partials:
         run = with_outputs(stages, list(partials))
-        for number, stage in enumerate(run):
-            if is_writer(stage):
-                run[number] = las_files.uncompressed_writer(stage, run[:number])
         with pdal_env.deferred_interrupts():
             result = pdal_env.execute(run, **options)
             pdal_env.check_interrupt()
-        compressed = las_files.compress(partials)
         check()
-    names = {str(path): final for path, final in zip(partials, outputs, strict=True)}
-    return result, names | {old: names.get(new, new) for old, new in compressed.items()}
+    return result, {str(path): final for path, final in zip(partials, outputs, strict=True)}
 
 
 def run_pipeline(source: str | Path | list | dict, overrides: Iterable[Override] = ()) -> Pipeline:

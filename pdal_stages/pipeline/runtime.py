@@ -15,7 +15,7 @@ import json
 import sys
 import uuid
 from collections import ChainMap
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
@@ -23,12 +23,14 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import InterruptedStage, StageError
 from ..base.messages import Report
 from ..stages.base import WHOLE_CLOUD, Stage, StageContext
-from ..stages.points import Points
+from ..stages.points import SELECTED, Points
 from ..stages.preprocessing import NEEDS_GROUND
 from ..stages.registry import place, stage_from
+from ..stages.where_expression import Expression
 from . import pdal as pdal_env
 
 
@@ -202,16 +204,9 @@ def run_on_view(
     outs: dict[str, Any],
 ) -> Report:
     """Run a stage on one view; return its report."""
-    if titles := pdal_env.overwritten_dimensions(module.get("metadata")):
-        raise StageError(
-            "extra bytes are named like dimensions of LAS, so PDAL has overwritten these",
-            found=", ".join(titles),
-            cure="Run the pipeline with pdal-stages pipeline, which reads such extra bytes under "
-            'other names; or name them all yourself: readers.las with "ignore_vlr": '
-            '"LASF_Spec/4" and "extra_dims": "Name=type,..."',
-        )
     lent = ins.keys() - outs.keys() if isinstance(ins, dict) else frozenset()
     points = points_of(stage, context, module, ins, lent)
+    _refuse_mixed_flags(points, pdal_env.point_formats(module.get("metadata")))
     for name in stage.reads():
         if name not in ins:
             raise points.missing(name, stage.hint)
@@ -226,6 +221,20 @@ def run_on_view(
             )
         outs[name] = array
     return points.report
+
+
+def _refuse_mixed_flags(points: Points, formats: Sequence[int]) -> None:
+    """Refuse classes with flags of LAS 1.0-1.3 that PDAL before 2.6 mixes up with those of LAS 1.4.
+
+    `formats` are the point formats of the files that were read. Beside formats 6 to 10, whose
+    classes go up to 255, nobody can tell flags from classes.
+    """
+    if not formats or min(formats) > 5 or max(formats) <= 5 or pdal_env.splits_class_flags():
+        return
+    largest = int(points.arrays["Classification"].max(initial=0))
+    if largest > LEGACY_LIMIT:
+        found = f"PDAL {pdal_env.dotted_version()}, Classification {largest}"
+        raise StageError(pdal_env.FLAGS_IN_CLASSES, found=found, cure=pdal_env.FLAGS_CURE)
 
 
 def run_on_nothing(stage: Stage) -> Report:
@@ -336,6 +345,22 @@ class Callbacks:
         self._held.append(callback := Callback(function))
         BY_LABEL[label] = callback
         return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **wiring}
+
+    def select(self, where: str, unknown: Collection[str]) -> dict[str, Any]:
+        """Return a filter that marks points for which a condition holds, as they come in.
+
+        `unknown` are dimensions that only stages create, so that no condition can name them.
+        """
+        condition = Expression(where)
+
+        def mark(module: Any, ins: Mapping[str, Any], outs: dict[str, Any]) -> None:
+            seen = {name: values for name, values in ins.items() if name not in unknown}
+            if pdal_env.flags_inside_classification(ins, module.get("metadata")):
+                seen["Classification"] = seen["Classification"] & np.uint8(LEGACY_LIMIT)
+            seen.pop(SELECTED, None)
+            outs[SELECTED] = condition.evaluate(seen).astype(np.uint8)
+
+        return self.filter(mark, {SELECTED: "uint8_t"})
 
     def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return the stages, with a check before those that crash old PDAL without ground."""

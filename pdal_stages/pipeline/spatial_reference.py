@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterable, Mapping
+import struct
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..base.errors import PipelineError, StageError
-from ..base.las import header_there, named_las, projection_digest
-from ..base.units import Units, name_of_wkt, parse_wkt, refuse_likely_degrees, units_of_wkt
+from ..base.las import (
+    PROJECTION,
+    header_there,
+    named_las,
+    projection_digest,
+    records_of,
+    says_wkt,
+)
+from ..base.las_check import check_readable
+from ..base.units import (
+    SYSTEMS,
+    Units,
+    name_of_wkt,
+    parse_wkt,
+    refuse_likely_degrees,
+    units_of_wkt,
+)
 from . import pdal as pdal_env
-from .inputs_outputs import readers_files
+from .inputs_outputs import LAS_READERS, readers_files
 from .runtime import reader_metadata, wkt_of
 
 #: Stages that may bring points into one reference.
@@ -36,76 +55,206 @@ class Reference:
     """The spatial reference of an input."""
 
     units: Units
-    plane: frozenset[str] = frozenset()  #: the projection's parameters; empty where not known
-    height: str = ""  #: the authority's code of the heights' system, where it is known
-    name: str = ""
     wkt: str = ""  #: of the whole system, with the heights' where the file names one
+    note: str = ""  #: a message about it
+
+    @property
+    def name(self) -> str:
+        """Return its name; empty without one."""
+        return name_of_wkt(self.wkt)
+
+    @property
+    def height(self) -> str:
+        """Return the authority's code of the heights' system; empty where it is not known."""
+        root = parse_wkt(self.wkt)
+        vertical = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
+        return vertical.code() if vertical else ""
+
+
+@cache
+def described(reference: str) -> tuple[str, frozenset[str]]:
+    """Return the well-known text of a reference and its projection's parameters, as PDAL has them.
+
+    `reference` is well-known text or a name such as ``EPSG:25832+5783``.
+    """
+    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": _POINT}
+    run = pdal_env.execute([{**point, "override_srs": reference}], arrays=False)
+    return _wkt_and_plane(reader_metadata(run.metadata).get("srs", {}))
+
+
+_POINT = "([1, 2], [1, 2], [1, 2])"
+
+
+def _wkt_and_plane(srs: Mapping[str, Any]) -> tuple[str, frozenset[str]]:
+    words = str(srs.get("proj4") or "").split()
+    return wkt_of(srs), frozenset(w for w in words if w not in _ALIKE and not _ASIDE.match(w))
+
+
+@cache
+def _wkt_of_keys(*records: tuple[int, bytes]) -> str:
+    """Return the well-known text of GeoTIFF keys.
+
+    PDAL reads it from a file of one point made for this: LAS 1.2, where every PDAL reads them.
+    """
+    parts = [
+        struct.pack("<H16sHH32x", 0, PROJECTION, number, len(data)) + data
+        for number, data in records
+    ]
+    head = bytearray(227)
+    head[:4], head[24:26] = b"LASF", bytes((1, 2))
+    offset = 227 + sum(map(len, parts))
+    struct.pack_into("<HIIBHI", head, 94, 227, offset, len(parts), 0, 20, 1)
+    struct.pack_into("<12d", head, 131, 1, 1, 1, *([0] * 9))
+    with TemporaryDirectory(prefix="pdal-stages-") as folder:
+        path = os.path.join(folder, "keys.las")
+        Path(path).write_bytes(bytes(head) + b"".join(parts) + bytes(20))
+        run = pdal_env.execute([{"type": "readers.las", "filename": path}], arrays=False)
+    wkt = wkt_of(reader_metadata(run.metadata).get("srs", {}))
+    if not wkt and "GDAL failure" in run.log:
+        raise _broken(pdal_env.log_lines(run.log)[-1])
+    return wkt
+
+
+def _broken(reason: str) -> PipelineError:
+    return PipelineError(pdal_env.BROKEN_REFERENCE, found=reason, cure=pdal_env.REFERENCE_CURE)
+
+
+#: Numbers of the records of GeoTIFF keys: the directory, its numbers, its texts.
+_KEYS = (34735, 34736, 34737)
+#: Number of the record with well-known text.
+_WKT = 2112
+
+
+def projection_records(path: str) -> list[tuple[int, bytes]]:
+    """Return the records of a LAS file's spatial reference, by number."""
+    return [(record.number, data) for record, data in records_of(path, PROJECTION)]
+
+
+def reference_of_las(path: str) -> tuple[str, str]:
+    """Return the well-known text of a LAS file's reference, and a message about it.
+
+    The text where the header's flag says so, else the GeoTIFF keys; the other one where there is
+    only that.
+    """
+    held = projection_records(path)
+    text = next((plain for number, data in held if number == _WKT and (plain := _text(data))), "")
+    keys = [(number, data) for number, data in held if number in _KEYS]
+    if not any(
+        number == _KEYS[0] and len(data) > 8 for number, data in keys
+    ):  # a directory of none
+        keys = []
+    if text and not _is_whole(text) and not described(text)[0]:
+        raise _broken(text[:60])
+    if not (text and keys):
+        return text or (_wkt_of_keys(*keys) if keys else ""), ""
+    of_keys = _wkt_of_keys(*keys)
+    taken, other = (text, of_keys) if says_wkt(path) else (of_keys, text)
+    if other and described(taken)[1] != described(other)[1]:
+        kinds = ("its text", "its GeoTIFF keys")
+        first, second = kinds if says_wkt(path) else kinds[::-1]
+        return taken, (
+            f"{path} names two spatial references: {first} ({name_of_wkt(taken)}) is taken, as its "
+            f"header says, not {second} ({name_of_wkt(other)})"
+        )
+    return taken or other, ""
+
+
+def _is_whole(wkt: str) -> bool:
+    """Return whether well-known text is plainly a system with its units; else PDAL judges it."""
+    root = parse_wkt(wkt)
+    if root is None or root.keyword not in SYSTEMS or not wkt.rstrip().endswith(("]", ")")):
+        return False
+    plane = root.find("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS")
+    globe = root.find("GEOGCS", "GEOGCRS", "GEODCRS", "GEODETICCRS", "GEOGRAPHICCRS", "GEOCCS")
+    return plane.unit() is not None if plane else globe is not None
+
+
+def _text(data: bytes) -> str:
+    return data.split(b"\0")[0].decode("utf-8", "replace").strip()
+
+
+def text_of(reader: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the well-known text of the reference of what a reader reads, and a message about it.
+
+    Of LAS files it is what their records say, or the reader's ``override_srs`` or
+    ``default_srs``; of others what PDAL says of as few points as possible.
+    """
+    path, note = str(reader["filename"]), ""
+    if reader["type"] not in LAS_READERS or header_there(path) is None:
+        run = pdal_env.execute([dict(reader)], arrays=False)
+        return _wkt_and_plane(reader_metadata(run.metadata).get("srs", {}))[0], ""
+    check_readable(path)  # PDAL, which may be asked for another file, crashes of damaged ones
+    wkt, note = ("", "") if reader.get("override_srs") else reference_of_las(path)
+    named = reader.get("override_srs") or (not wkt and reader.get("default_srs"))
+    return (described(str(named))[0] if named else wkt), note
 
 
 def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str = "") -> Reference:
-    """Return the reference of what a reader reads, according to PDAL.
+    """Return the reference of what a reader reads; see :func:`text_of`.
 
-    `horizontal` and `vertical` override the unit of x and y, and of z. The reader should be
-    restricted to as few points as possible.
+    `horizontal` and `vertical` override the unit of x and y, and of z.
     """
-    # Without extra bytes: of a file with odd ones, all of it would be copied for a single point.
-    plain = {"ignore_vlr": "LASF_Spec/4"} if reader["type"] == "readers.las" else {}
     path = str(reader["filename"])
-    run = pdal_env.execute([plain | dict(reader)], arrays=False)
-    srs = reader_metadata(run.metadata).get("srs", {})
-    wkt = wkt_of(srs)
-    if not wkt and "GDAL failure" in run.log:
-        reason, cure = pdal_env.log_lines(run.log)[-1], pdal_env.REFERENCE_CURE
-        raise PipelineError(pdal_env.BROKEN_REFERENCE, where=path, found=reason, cure=cure)
-    header = header_there(path)
-    count, box = (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
-    middle = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2) if count else None
+    header = header_there(path) if reader["type"] in LAS_READERS else None
     try:
+        wkt, note = text_of(reader)
+        count, box = (header.count, header.box) if header else (0, (0.0, 0.0, 0.0, 0.0))
+        middle = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2) if count else None
         units = units_of_wkt(wkt, horizontal=horizontal, vertical=vertical, place=middle)
         if units.assumed:
             refuse_likely_degrees(count, *box)
     except StageError as error:
         raise error.at(path) from None
-    words = str(srs.get("proj4") or "").split()
-    plane = frozenset(w for w in words if w not in _ALIKE and not _ASIDE.match(w))
-    root = parse_wkt(wkt)
-    height = root.find("VERT_CS", "VERTCRS", "VERTICALCRS") if root else None
-    return Reference(units, plane, height.code() if height else "", name_of_wkt(wkt), wkt)
+    return Reference(units, wkt, note)
 
 
 @cache
 def fault_of_reference(name: str) -> str:
     """Return why coordinates in a reference, as PDAL takes its name, suit no stage; else empty.
 
-    PDAL is asked for a single point, and reports a name that it does not know itself.
+    PDAL reports a name that it does not know itself.
     """
-    box = "([1, 2], [1, 2], [1, 2])"
-    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": box}
     with suppress(PipelineError):
-        run = pdal_env.execute([{**point, "override_srs": name}], arrays=False)
+        wkt, _ = described(name)
         try:
-            units_of_wkt(wkt_of(reader_metadata(run.metadata)))
+            units_of_wkt(wkt)
         except StageError as error:
             return error.what
     return ""
 
 
-def plane_unit(stages: Iterable[Mapping[str, Any]], metadata: Mapping[str, Any]) -> float | None:
-    """Return meters per unit of x and y from a run's `metadata` of PDAL; None if not known."""
-    if any(stage["type"] in MOVING or "a_srs" in stage for stage in stages):
-        return None
-    with suppress(StageError):
-        if wkt := wkt_of(reader_metadata(metadata)):
-            return units_of_wkt(wkt).horizontal
-    return None
-
-
 def reference_of_file(path: str, horizontal: str = "", vertical: str = "") -> Reference:
     """Return the reference of a file; see :func:`reference_of`."""
     las = named_las(path) and header_there(path) is not None
-    one_point = {"type": "readers.las", "count": 1} if las else {}
-    reader = pdal_env.with_types([{"filename": path, **one_point}])[0]
+    kind = {"type": "readers.las"} if las else {}
+    reader = pdal_env.with_types([{"filename": path, **kind}])[0]
     return reference_of(reader, horizontal, vertical)
+
+
+def records_for(named: str, path: str) -> list[tuple[int, bytes]]:
+    """Return the records that name a reference system in a copy of a LAS file.
+
+    LAS 1.4 takes any as well-known text; earlier versions take systems with a code of EPSG's, as
+    GeoTIFF keys.
+    """
+    wkt, _ = described(named)
+    header = header_there(path)
+    if header is not None and header.minor >= 4:
+        return [(_WKT, wkt.encode() + b"\0")]
+    codes = re.fullmatch(r"EPSG:(\d+)(?:\+(\d+))?", named.strip(), re.IGNORECASE)
+    root = parse_wkt(wkt)
+    if codes is None or root is None or root.find("PROJCS", "PROJCRS") is None:
+        raise PipelineError(
+            "LAS 1.0 to 1.3 names a projected reference system by EPSG's code",
+            where=path,
+            found=named,
+            cure="Give its code (EPSG:CODE, or EPSG:CODE+CODE with that of the heights), or "
+            "convert the file to LAS 1.4 first",
+        )
+    heights = [(4096, int(codes[2]))] if codes[2] else []
+    keys = [(1024, 1), (1025, 1), (3072, int(codes[1])), *heights]
+    rows = [(1, 1, 0, len(keys)), *((key, 0, 1, value) for key, value in keys)]
+    return [(_KEYS[0], b"".join(struct.pack("<4H", *row) for row in rows))]
 
 
 def check_one_reference(references: Mapping[str, Reference]) -> list[str]:
@@ -119,12 +268,14 @@ def check_one_reference(references: Mapping[str, Reference]) -> list[str]:
         "reference systems": {},
         "reference systems of heights": {},
     }
+    several = len({reference.wkt for reference in references.values()}) > 1
     for path, reference in references.items():
         across, upward = reference.units.horizontal, reference.units.vertical
         assumed = ", as there is no spatial reference" if reference.units.assumed else ""
         text = f"{across:g} m across and {upward:g} m upward in {path}{assumed}"
         named = f"{reference.name} in {path}"
-        values = ((across, upward), text), (reference.plane, named), (reference.height, named)
+        plane = described(reference.wkt)[1] if several and reference.wkt else frozenset()
+        values = ((across, upward), text), (plane, named), (reference.height, named)
         for inputs, (value, shown) in zip(kinds.values(), values, strict=True):
             if value:
                 inputs.setdefault(value, shown)
@@ -157,7 +308,7 @@ def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[st
         options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}
         for path in readers_files([stage], las=True):
             kind_of[path] = f"{projection_digest(path)} {options}"
-            kinds[kind_of[path]] = {**options, "filename": path, "count": 1}
+            kinds[kind_of[path]] = {**options, "filename": path}
     if len(kinds) < 2:
         return []
     of_kind = {kind: reference_of(reader, horizontal) for kind, reader in kinds.items()}

@@ -8,23 +8,24 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from ..base import checks
-from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs, whole_files
 from ..base.grid import places_among
 from ..base.las import named_copc
+from ..base.las_check import check_complete
+from ..base.las_points import LasColumns, Layout
 from ..base.vector import Overlay, points_inside, polygons_of, reading, vector
 from ..classifier.input_dimensions import CHECKED
 from ..pipeline.accuracy_files import paired
+from ..pipeline.copies import copy_of, write_copy
 from ..pipeline.inputs_outputs import input_files, is_folder, outputs_of
-from ..pipeline.las_files import can_read_chunks, finish, laspy_header, read_chunks
+from ..pipeline.point_files import can_read_chunks
 from ..pipeline.spatial_reference import reference_of_file
 
 #: Share of points without a partner beyond which two files hold different points: large enough for
@@ -38,7 +39,7 @@ PATCHES = "patches"
 #: Column of that layer, 1 for checked patches.
 DONE = "done"
 #: Dimensions that distinguish points at the same coordinates, in this order.
-_DISTINGUISHING = ("gps_time", "return_number", "number_of_returns", "classification")
+_DISTINGUISHING = ("GpsTime", "ReturnNumber", "NumberOfReturns", "Classification")
 
 
 class _NothingCheckedError(StageError):
@@ -145,9 +146,10 @@ def _correct(
     """
     before = pair.before
     reference = reference_of_file(before)
-    las = _read(before)
-    xyz = np.column_stack([las.x, las.y, las.z])
-    codes = np.asarray(las.classification).astype(np.uint8)
+    layout = Layout.of(before)
+    las = LasColumns(before, layout)
+    xyz = np.column_stack([las[axis] for axis in "XYZ"])
+    codes = las["Classification"]
     warnings: list[str] = []
     new = _edited_codes(before, pair.after, las, xyz, codes, warnings) if pair.after else codes
     changed = new != codes
@@ -159,19 +161,14 @@ def _correct(
             checked |= _in_area(area, xyz, reference.wkt, warnings)
         except _NothingCheckedError as error:
             errors.append(error)
-    if CHECKED in las.point_format.extra_dimension_names:
-        checked |= np.asarray(las[CHECKED]) > 0
-    elif CHECKED in las.point_format.dimension_names:
-        raise StageError(f"'{CHECKED}' is a dimension of another kind", where=before)
+    if CHECKED in las:
+        checked |= las[CHECKED] > 0
     if not checked.any():
         raise _NothingCheckedError(
             "nothing was changed, and no point lies in a checked area",
             found=", ".join(filter(None, (pair.after, *missed))),
         )
-    _store(las, new, checked, before)
-    (part,) = outputs.enter_context(whole_files(pair.output))
-    las.write(str(part))
-    finish(part, [before])
+    _write(layout, las, pair.output, new, checked, outputs)
     return [*_describe(codes, new, checked), *warnings]
 
 
@@ -197,52 +194,46 @@ def _refuse_files(pairs: Sequence[_Pair], areas: Sequence[str]) -> None:
     check_outputs([Output(pair.output, "output") for pair in pairs], [*inputs, *areas])
 
 
-def _store(las: Any, codes: NDArray[np.uint8], checked: NDArray[np.bool_], before: str) -> None:
-    """Set classes, Checked and Reliability of a file's points."""
-    import laspy
+def _write(
+    layout: Layout,
+    las: LasColumns,
+    output: str,
+    codes: NDArray[np.uint8],
+    checked: NDArray[np.bool_],
+    outputs: ExitStack,
+) -> None:
+    """Write a copy of a file with classes, Checked and Reliability of its points.
 
-    if las.header.point_format.id < 6 and codes.max() > LEGACY_LIMIT:
-        raise StageError(
-            f"classes above {LEGACY_LIMIT} do not fit the file, which is of LAS 1.0-1.3",
-            where=before,
-            found=f"class {int(codes.max())}",
-            cure="Convert it to LAS 1.4 first (minor_version 4, dataformat_id 6)",
-        )
-    if CHECKED not in las.point_format.extra_dimension_names:
-        las.add_extra_dim(laspy.ExtraBytesParams(CHECKED, "uint8", "1: a person has checked it"))
-    las.classification, las[CHECKED] = codes, checked.astype(np.uint8)
-    if "Reliability" in las.point_format.extra_dimension_names:
-        las["Reliability"] = np.where(checked, 1.0, las["Reliability"])
+    It gets its name when `outputs` are closed.
+    """
+    values = {"Classification": codes, CHECKED: checked.astype(np.uint8)}
+    kinds = {CHECKED: "uint8_t"}
+    if "Reliability" in layout.own:
+        values["Reliability"] = np.where(checked, 1.0, las["Reliability"])
+        kinds["Reliability"] = "float"
+    copy = copy_of(las.path, layout, output, kinds, {})
 
+    def check(partial: Path, final: Path, number: int) -> None:
+        check_complete(partial, final, {"type": "writers.las"}, copy.count)
 
-def _read(path: str) -> Any:
-    """Return a whole file as laspy holds it; a COPC file as plain LAZ."""
-    import laspy
-
-    header = laspy_header(path)
-    out = laspy.LasData(header)
-    if chunks := [chunk.array for chunk in read_chunks(path)]:
-        out.points = laspy.ScaleAwarePointRecord(
-            np.concatenate(chunks), header.point_format, header.scales, header.offsets
-        )
-    return out
+    (part,) = outputs.enter_context(whole_files(output, check=check))
+    write_copy(copy, part, values)
 
 
 def _edited_codes(
     before: str,
     after: str,
-    las: Any,
+    las: LasColumns,
     xyz: NDArray[np.float64],
     codes: NDArray[np.uint8],
     warnings: list[str],
 ) -> NDArray[np.uint8]:
     """Return the classes of the same points in another file; their former ones where missing."""
-    other = _read(after)
-    theirs = np.column_stack([other.x, other.y, other.z])
-    steps = np.maximum(las.header.scales, other.header.scales)
-    both = {*las.point_format.dimension_names} & {*other.point_format.dimension_names}
-    names = [name for name in _DISTINGUISHING if name in both]
-    pairs = [(np.asarray(las[name]), np.asarray(other[name])) for name in names]
+    other = LasColumns(after, Layout.of(after))
+    theirs = np.column_stack([other[axis] for axis in "XYZ"])
+    steps = np.maximum(las.layout.header.scales, other.layout.header.scales)
+    names = [name for name in _DISTINGUISHING if name in las and name in other]
+    pairs = [(las[name], other[name]) for name in names]
     index = match_points(xyz, theirs, steps, pairs, max_steps=MAX_STEPS)
     lost, extra = int((index < 0).sum()), len(theirs) - int((index >= 0).sum())
     if max(lost, extra) > MAX_LOST_SHARE * len(xyz):
@@ -256,7 +247,7 @@ def _edited_codes(
         warnings.append(f"{lost:,} points are missing in {after}: they keep their class, unchecked")
     if extra:
         warnings.append(f"{extra:,} points of {after} are not in {before}: left out")
-    return np.where(index >= 0, np.asarray(other.classification).astype(np.uint8)[index], codes)
+    return np.where(index >= 0, other["Classification"][index], codes)
 
 
 def _in_area(

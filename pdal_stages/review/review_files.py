@@ -27,7 +27,7 @@ from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD, find
 from ..pipeline.distinct_files import DistinctFiles
 from ..pipeline.inputs_outputs import input_files
-from ..pipeline.las_files import can_read_chunks, read_columns
+from ..pipeline.point_files import can_read_chunks, read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..reports.vector_files import Layer, check_target, qml, write_layers
 from ..stages.points import Points

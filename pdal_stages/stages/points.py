@@ -36,6 +36,8 @@ METERS_ASSUMED = "the points have no spatial reference: meters were assumed"
 NO_POINT_MATCHES = "'where' matches no points:"
 #: The same for polygons of a file that lie nowhere near the points.
 NO_POLYGON_NEAR = "no polygon lies where the points are (check the reference systems of both):"
+#: How names of dimensions begin that runs use for themselves.
+RESERVED = "PdalStages"
 #: The dimension in which `classify` marks the points that its `where` selects.
 SELECTED = "PdalStagesSelected"
 #: Steps to which coordinates are rounded; scales of LAS files are whole numbers of them, as a rule.

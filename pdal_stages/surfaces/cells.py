@@ -17,6 +17,7 @@ from ..base import checks
 from ..base.asprs import NOISE, TERRAIN, WIRES_AND_TOWERS
 from ..base.grid import GridWindow, begins_run, cell_numbers
 from ..tiling.options import LARGEST_TILE, TILE_POINT, Density
+from ..tiling.tile_records import Part
 
 Integers = NDArray[np.int64]
 #: Steps of coordinates in their unit: what surveys store is seldom finer.
@@ -65,9 +66,9 @@ def steps(coordinate: NDArray) -> Integers:
 
 
 def reduce_points(
-    parts: Sequence[tuple[str, Any]], options: SurfaceOptions, unit: float
+    parts: Sequence[Part], options: SurfaceOptions, unit: float
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Reduce points of a tile (files and their laspy records) to cells.
+    """Reduce points of a tile (files and their dimensions) to cells.
 
     Noise and withheld points are left out. `unit` is that of the coordinates, in meters.
 
@@ -82,9 +83,9 @@ def reduce_points(
     """
     columns = []
     for _, part in parts:
-        codes = np.asarray(part.classification)
-        kept = ~np.isin(codes, NOISE) & ~np.asarray(part.withheld, bool)
-        xyz = np.column_stack([steps(np.asarray(part[name])[kept]) for name in "xyz"])
+        codes = part["Classification"]
+        kept = ~np.isin(codes, NOISE) & (part["Withheld"] == 0)
+        xyz = np.column_stack([steps(part[name][kept]) for name in "XYZ"])
         columns.append((xyz.reshape(-1, 3), codes[kept]))
     xyz = np.concatenate([np.empty((0, 3), np.int64), *(points for points, _ in columns)])
     codes = np.concatenate([np.empty(0, np.uint8), *(codes for _, codes in columns)])

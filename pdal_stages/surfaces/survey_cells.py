@@ -16,6 +16,7 @@ from ..base.asprs import NOISE, OVERLAP, TERRAIN, WATER
 from ..base.distinct import DistinctPoints
 from ..base.grid import GridWindow, cell_numbers
 from ..tiling.jobs import load_arrays, save_arrays
+from ..tiling.tile_records import Part
 from .cells import EMPTY, STEPS, Integers, steps
 
 #: Of points without times: a first time that is later than all.
@@ -40,18 +41,18 @@ class ReportRules:
         return {"density": self.density, "void": self.void, "picture": self.picture}
 
 
-def describe(part: Any) -> dict[str, Any]:
-    """Return counts, and extents of x, y, z and times, of points (a laspy record) as JSON types."""
-    codes, names = np.asarray(part.classification), set(part.point_format.dimension_names)
-    overlap = np.asarray(part.overlap, bool) if "overlap" in names else codes == OVERLAP
+def describe(part: Mapping[str, NDArray]) -> dict[str, Any]:
+    """Return counts, and extents of x, y, z and times, of points as JSON types."""
+    codes = part["Classification"]
+    overlap = part["Overlap"] != 0 if "Overlap" in part else codes == OVERLAP
     times = _times(part)
-    flags = {"last_returns": _is_last(part), "withheld": part.withheld, "overlap": overlap}
+    flags = {"last_returns": _is_last(part), "withheld": part["Withheld"], "overlap": overlap}
     counts = {"points": len(codes)} | {name: int(np.sum(flag)) for name, flag in flags.items()}
-    counted = {"classes": codes, "returns": part.return_number, "sources": part.point_source_id}
+    counted = {"classes": codes, "returns": part["ReturnNumber"], "sources": part["PointSourceId"]}
     for name, values in counted.items():
-        unique, count = np.unique(np.asarray(values), return_counts=True)
+        unique, count = np.unique(values, return_counts=True)
         counts |= {f"{name} {v}": n for v, n in zip(unique.tolist(), count.tolist(), strict=True)}
-    axes = [*(np.asarray(part[name]) for name in "xyz"), times[np.isfinite(times) & (times != 0)]]
+    axes = [*(part[name] for name in "XYZ"), times[np.isfinite(times) & (times != 0)]]
     extent = [[float(v.min(initial=NEVER)), float(v.max(initial=-NEVER))] for v in axes]
     return {"counts": counts, "extent": extent}
 
@@ -76,21 +77,20 @@ def figures_of(part: Mapping[str, Any]) -> dict[str, Any]:
     return {**out, "times": times if times[0] < NEVER else None}
 
 
-def _times(part: Any) -> NDArray[np.float64]:
+def _times(part: Mapping[str, NDArray]) -> NDArray[np.float64]:
     """Return the GPS times of points (n,), 0 where they are not known."""
-    known = "gps_time" in part.point_format.dimension_names
-    return np.asarray(part.gps_time) if known else np.zeros(len(part))
+    return part["GpsTime"] if "GpsTime" in part else np.zeros(len(part["X"]))
 
 
-def _is_last(part: Any) -> NDArray[np.bool_]:
+def _is_last(part: Mapping[str, NDArray]) -> NDArray[np.bool_]:
     """Return which points (n,) are the last of their pulse; those without numbers are."""
-    return np.asarray(part.return_number) >= np.asarray(part.number_of_returns)
+    return part["ReturnNumber"] >= part["NumberOfReturns"]
 
 
 def reduce_for_report(
-    parts: Sequence[tuple[str, Any]], rules: ReportRules, control: NDArray[np.float64]
+    parts: Sequence[Part], rules: ReportRules, control: NDArray[np.float64]
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Reduce points of a tile: files and their laspy records.
+    """Reduce points of a tile: files and their dimensions.
 
     Returns
     -------
@@ -106,12 +106,11 @@ def reduce_for_report(
     """
     columns, distinct = [], DistinctPoints()
     for _, part in parts:
-        codes = np.asarray(part.classification)
-        kept = ~np.isin(codes, NOISE) & ~np.asarray(part.withheld, bool)
-        where = {axis.upper(): np.asarray(part[axis]) for axis in "xyz"}
-        kept &= distinct.first({**where, "GpsTime": _times(part)})
-        xyz = [steps(np.asarray(part[name])) for name in "xyz"]
-        more = codes, _is_last(part), np.asarray(part.point_source_id)
+        codes = part["Classification"]
+        kept = ~np.isin(codes, NOISE) & (part["Withheld"] == 0)
+        kept &= distinct.first({**{axis: part[axis] for axis in "XYZ"}, "GpsTime": _times(part)})
+        xyz = [steps(part[name]) for name in "XYZ"]
+        more = codes, _is_last(part), part["PointSourceId"]
         columns.append(np.column_stack([*xyz, *(np.asarray(v, np.int64) for v in more)])[kept])
     points = np.concatenate([np.empty((0, 6), np.int64), *columns])
     files = {path: describe(part) for path, part in parts}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -13,7 +12,7 @@ from pathlib import Path
 from ..base import las
 from ..base.errors import OptionError, StageError
 from ..base.files import Output, check_outputs
-from ..base.las_check import beyond_box
+from ..pipeline.classify_file import classify_file
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_folder, is_las, outputs_of
 from ..pipeline.pdal import knows_copc, writer_of
@@ -105,13 +104,7 @@ class ClassifyTask:
         with self.folders():
             pipeline = self.request.pipeline(source, target)
             pipeline.check_outputs(*self.extra_files, read=self.inputs)
-            count = pipeline.execute(arrays=False, loglevel=logging.WARNING)
-        messages = [
-            *(f"PDAL says: {line}" for line in pipeline.log_lines),
-            *pipeline.messages,
-        ]
-        if header is not None and is_las(target) and (written := las.read_header(target)):
-            messages += filter(None, [beyond_box(source, written.box)])
+            count, messages = classify_file(pipeline, self.request, source)
         reports = [each[-1] for _, each in pipeline.reports if each]
         classes = [report.codes for report in reports if report.codes is not None][-1:]
         output.state = "done"
@@ -166,6 +159,7 @@ class ClassifyTask:
             else plan.creates,
             makes=extra_dims,
             extra_dims=extra_dims,
+            where=self.request.where,
             name=self.request.model,
         )
         with nullcontext() if dry_run else self.folders():

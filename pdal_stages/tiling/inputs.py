@@ -225,7 +225,7 @@ class Survey:
             kind = fingerprint(source.reader, las.projection_digest(source.path))
             try:
                 if kind not in known:  # as PDAL's reader reports it after one point
-                    reader = {**source.reader, "filename": source.path, "count": 1}
+                    reader = {**source.reader, "filename": source.path}
                     known[kind] = reference_of(reader, plan.unit)
             except PipelineError as error:
                 source.fault = str(error)
@@ -246,6 +246,7 @@ class Survey:
                     "both"
                 )
             self.messages += messages
+        self.messages += filter(None, dict.fromkeys(each.note for each in references.values()))
         first, *others = references.values()
         return next((each for each in others if each.name and not first.name), first)
 

@@ -25,15 +25,13 @@ from ..pipeline.distinct_files import DistinctFiles
 from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.json_source import Override
-from ..pipeline.las_files import read_columns
+from ..pipeline.point_files import read_columns
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
 from ..reports.object_layers import write_objects
 from ..stages.write_objects import STRAIGHT, WriteObjects
 
 #: Stages whose options the commands accept for objects.
 OPTIONS_OF = ("writers.objects", "filters.objects")
-#: Dimensions that are read of LAZ 1.4 (see :func:`.las_files.read_chunks`).
-_ONLY = ("Z", "CLASSIFICATION", "FLAGS", "GPS_TIME", "ALL_EXTRA_BYTES")
 #: Meters; cells are not enlarged beyond this automatically: neighboring houses would merge.
 LARGEST_CELL = 4.0
 
@@ -119,7 +117,7 @@ def _cells_of(
     """Return the cells of a file, and its numbers of points (256,) by class code."""
     seen = np.zeros(256, np.int64)
     cells = Cells(stage.settings.cell)
-    for columns, flags in read_columns(path, ("Reliability", "GpsTime"), _ONLY):
+    for columns, flags in read_columns(path, ("Reliability", "GpsTime")):
         first = distinct.first(columns)
         arrays = {name: values[first] for name, values in columns.items()}
         points = stage.points(arrays, wkt=wkt, legacy_flags=flags)

@@ -11,6 +11,7 @@ from typing import Any
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..classifier.model_file import shipped
+from ..pipeline.copies import read_here
 from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import named_files, named_outputs, outputs_of, writes_las
 from ..pipeline.json_source import Override
@@ -88,6 +89,9 @@ class TilePlan:
     #: Dimensions that our stages create and outputs hold, with PDAL's types; files without points
     #: get them, too.
     makes: dict[str, str] = field(default_factory=dict)
+    where: str | None = None  #: the points that stages act on, as they come in
+    read_here: bool = False  #: PDAL does not read the points, and all stages of the head are ours
+    copied: bool = False  #: outputs are copies of inputs, without PDAL
 
     @property
     def writers(self) -> list[dict[str, Any]]:
@@ -125,6 +129,7 @@ class RunContext:
     bounds: Box  #: of all inputs
     threads: int
     most_points: int  #: a tile is not read with a wider halo that holds more
+    wkt: str  #: the spatial reference of the inputs
     scratch: str  #: folder for temporary files
     kept: str  #: folder with the results of rounds
 
@@ -213,6 +218,8 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         unit=next(filter(None, (stage.horizontal_unit for stage in stages)), ""),
         messages=list(pipeline.expanded.warnings),
         name=source.name,
+        read_here=read_here([*source.stages[: len(readers)], *(step.options for step in head)]),
+        copied=pipeline.copied,
     )
 
 
@@ -225,7 +232,7 @@ def plan_of_files(
     """Plan stages after a reader of files; return the pipeline with the first one, too."""
     # PDAL reads extra dimensions of LAS 1.0-1.3 only with the last option.
     reader = {"type": "readers.las", "filename": files[0], "tag": "input", "use_eb_vlr": True}
-    pipeline = Pipeline([reader, *stages], overrides, whole=False)
+    pipeline = Pipeline([reader, *stages], overrides, may_copy=True)
     plan = make_plan(pipeline, buffer)
     plan.readers[0]["filename"] = list(files)
     return plan, pipeline

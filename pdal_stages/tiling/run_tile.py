@@ -17,6 +17,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, cast
 
@@ -26,26 +27,22 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.grid import places_among
-from ..pipeline.las_files import check_las_limits
+from ..base.las_copy import LasCopy
+from ..base.las_points import RecordColumns, SomeRows
+from ..pipeline.copies import selection
+from ..pipeline.pdal_facts import check_outputs
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
 from ..stages.base import WHOLE_CLOUD, FarReaching, inside_block
-from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, class_counts
+from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, SELECTED, class_counts
 from ..stages.registry import stage_types
 from .inputs import InputSource
 from .jobs import SavedArrays, load_arrays, save_arrays, written
 from .options import Box, TileGrid, inside
 from .plan import INPUT, OUTSIDE, ROW, RunContext
 from .sorted_points import Piece, cut_all
-from .write_outputs import (
-    NewValues,
-    PieceResults,
-    arrays_of,
-    flags_in_classes,
-    read_with,
-    write_tile,
-)
+from .write_outputs import PieceResults, arrays_of, write_tile
 
 #: How many times a tile is read again with a wider halo (not tuned); one that needs more is
 #: reported as ``short``.
@@ -56,7 +53,7 @@ _MARKS = (ROW, INPUT, OUTSIDE)
 # ---- results of earlier rounds -------------------------------------------------------------------
 
 #: Dimension -> rows of a piece and their new values.
-ChangedValues = dict[str, tuple[NDArray[np.int64] | None, NDArray]]
+ChangedValues = dict[str, tuple[NDArray[np.int64], NDArray]]
 
 #: Stages of the run that this process works for, by its temporary folder.
 _ready: dict[str, list[ExpandedStage | None]] = {}
@@ -67,7 +64,7 @@ def ready_stages(context: RunContext) -> list[ExpandedStage | None]:
     if context.scratch not in _ready:
         _ready.clear()
         head = [with_threads(step, context.threads) for step in context.plan.head]
-        expanded = Pipeline(head, whole=False).expanded.ours if head else []
+        expanded = Pipeline(head).expanded.ours if head else []
         ours = {stage.number: stage for stage in expanded}
         _ready[context.scratch] = [ours.get(number) for number in range(len(head))]
     return _ready[context.scratch]
@@ -184,6 +181,7 @@ class _HeadRun:
     pieces: list[Piece]
     halo_m: float  #: within which they were read
     complete: bool  #: all points of the inputs were read, so none lies farther away
+    folder: str  #: for files of this run
     callbacks: Callbacks = field(default_factory=Callbacks)
     needs_m: list[float] = field(default_factory=lambda: [0.0])  #: halos that stages need
     #: Dimensions of the tile's own points alone, to save memory; one for each view.
@@ -195,28 +193,25 @@ class _HeadRun:
 
     def run(self) -> HeadResult:
         """Run the steps of the round."""
-        plan, ready = self.context.plan, ready_stages(self.context)
-        part, stages = plan.rounds[self.number], self._stages()
-        ours = [stage for stage in ready[part.begin : part.end] if stage is not None]
-        pipeline = Pipeline(stages, whole=False, ready=ours)
-        self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
-        if part.end == len(plan.head):  # class codes of earlier rounds may still be changed
-            check_las_limits([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
-        for number, stage in self.expanded.items():
-            used_m = part.used_m[self.steps[number] - part.begin]
-            stage.update_context(outside=OUTSIDE, used_m=used_m)
-        earlier = plan.rounds[self.number - 1] if self.number else None
-        if earlier is not None and earlier.blocks is not None:
-            far = next(n for n, step in self.steps.items() if step == earlier.end)
-            blocks = load_blocks(self.context, self._box(), self.halo_m)
-            self.expanded[far].update_context(blocks=blocks)
-        pipeline.execute(arrays=False)
+        plan = self.context.plan
+        part = plan.rounds[self.number]
+        marks = self._marks()
+        pipeline = self._pipeline(marks)
+        if plan.read_here:
+            parts = [(piece.layout, piece.records) for piece in self.pieces]
+            known = _concatenate_by_name(marks)
+            seen = pipeline.run_here(RecordColumns(parts), self.context.wkt, known, self._after)
+            self._take({"spatialreference": {"wkt": self.context.wkt}}, seen, {})
+        else:
+            pipeline.execute(arrays=False)
         if not self.complete:
             for number, stage in self.expanded.items():
                 step = self.steps[number] - part.begin
                 distance_m = part.used_m[step] + part.upstream_m[step]
                 self.needs_m += [distance_m + r.reach for r in stage.reports if r.beyond_halo]
         messages = _messages(pipeline, self.context.scratch)
+        if plan.where and len(marks) and not any(mark[SELECTED].any() for mark in marks):
+            messages.append(f"{NO_POINT_MATCHES} {plan.where}")
         return HeadResult(
             _collect(self.views, self.pieces),
             max(self.needs_m),
@@ -225,6 +220,38 @@ class _HeadRun:
             self.reduced,
         )
 
+    def _marks(self) -> list[dict[str, NDArray]]:
+        """Return dimensions that number a piece's points, with what an earlier round changed."""
+        plan, context = self.context.plan, self.context
+        changed = [ChangedValues()] * len(self.pieces)
+        if self.number and plan.rounds[self.number - 1].kept:
+            box = self._box(self.halo_m / context.unit)
+            changed = load_changes(context, self.number - 1, box, self.pieces)
+        return [
+            _marked(number, piece, context, changed[number])
+            for number, piece in enumerate(self.pieces)
+        ]
+
+    def _pipeline(self, marks: Sequence[Mapping[str, NDArray]]) -> Pipeline:
+        """Return the pipeline of the round, its stages with their contexts."""
+        plan, ready = self.context.plan, ready_stages(self.context)
+        part = plan.rounds[self.number]
+        stages = self._stages_here() if plan.read_here else self._stages(marks)
+        ours = [stage for stage in ready[part.begin : part.end] if stage is not None]
+        pipeline = Pipeline(stages, ready=ours)
+        self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
+        if part.end == len(plan.head) and not plan.copied:  # codes of earlier rounds may change
+            check_outputs([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
+        for number, stage in self.expanded.items():
+            used_m = part.used_m[self.steps[number] - part.begin]
+            stage.update_context(outside=OUTSIDE, used_m=used_m)
+        earlier = plan.rounds[self.number - 1] if self.number else None
+        if earlier is not None and earlier.blocks is not None:
+            far = next(n for n, step in self.steps.items() if step == earlier.end)
+            blocks = load_blocks(self.context, self._box(), self.halo_m)
+            self.expanded[far].update_context(blocks=blocks)
+        return pipeline
+
     @property
     def _is_last(self) -> bool:
         return self.number + 1 == len(self.context.plan.rounds)
@@ -232,26 +259,37 @@ class _HeadRun:
     def _box(self, halo_units: float = 0.0) -> Box:
         return self.context.grid_of(self.number).box(self.tile, halo_units)
 
-    def _stages(self) -> list[dict[str, Any]]:
-        """Return the pipeline: readers, the steps, and functions that take their results."""
+    def _stages_here(self) -> list[dict[str, Any]]:
+        """Return the pipeline of a round that runs without PDAL: a reader and the steps."""
+        part = self.context.plan.rounds[self.number]
+        stages: list[dict[str, Any]] = [{**self.pieces[0].reader, "filename": "piece.las"}]
+        for number in range(part.begin, part.end):
+            self.steps[len(stages)] = number
+            stages.append(with_threads(self.context.plan.head[number], self.context.threads))
+        return stages
+
+    def _stages(self, marks: Sequence[Mapping[str, NDArray]]) -> list[dict[str, Any]]:
+        """Return the pipeline of a round with PDAL's filters.
+
+        It reads pieces that are written for it, with their marks as extra bytes, runs the steps,
+        and calls functions that take their results.
+        """
         plan, context = self.context.plan, self.context
-        part, changed = plan.rounds[self.number], [ChangedValues()] * len(self.pieces)
-        if self.number and plan.rounds[self.number - 1].kept:
-            box = self._box(self.halo_m / context.unit)
-            changed = load_changes(context, self.number - 1, box, self.pieces)
-        marked = [
-            _marked(number, piece, context.unit, changed[number])
-            for number, piece in enumerate(self.pieces)
-        ]
-        flags = [flags_in_classes(piece.path) for piece in self.pieces]
-        readers = [{**piece.reader, "filename": piece.path} for piece in self.pieces]
-        mixed = flags if len(set(flags)) > 1 else []
-        stages, last_read = read_with(self.callbacks, readers, marked, mixed)
-        steps = plan.head[part.begin : part.end]
+        stages = []
+        for number, (piece, mark) in enumerate(zip(self.pieces, marks, strict=True)):
+            path = os.path.join(self.folder, f"piece{number}.las")
+            added = {n: v.dtype for n, v in mark.items() if n not in piece.layout.names}
+            copy = LasCopy(piece.source.path, piece.layout, False, added)
+            with copy.writing_to(Path(path)):
+                copy.write(piece.records, mark)
+            reader = {**piece.reader, "filename": path, "tag": f"in{number}"}
+            stages.append({**reader, "use_eb_vlr": True})
+        tags = [stage["tag"] for stage in stages]
+        part = plan.rounds[self.number]
         # PDAL's own filters see one file at a time, until a stage merges them.
         apart = len(self.pieces) > 1
         head_begins = len(stages)
-        for number, step in enumerate(steps, part.begin):
+        for number, step in enumerate(plan.head[part.begin : part.end], part.begin):
             if apart and _merges(step):
                 stages.append({"type": "filters.merge"})
                 apart = False
@@ -263,8 +301,14 @@ class _HeadRun:
                 if kind.open_ended and not self.complete:
                     stages.append(self.callbacks.filter(partial(self._measure_reach, place)))
         stages.append(self.callbacks.filter(self._take))
-        stages[head_begins]["inputs"] = [last_read]
+        stages[head_begins]["inputs"] = tags
         return stages
+
+    def _after(self, expanded: ExpandedStage, seen: Mapping[str, NDArray]) -> None:
+        """Ask an open-ended stage that has run which halo it needs."""
+        if expanded.stage.open_ended and not self.complete:
+            module = {"spatialreference": {"wkt": self.context.wkt}}
+            self._measure_reach(expanded.number, module, seen, {})
 
     def _measure_reach(
         self, place: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
@@ -285,12 +329,11 @@ class _HeadRun:
         self.views.append({name: ins[name][rows] for name in marks})
         if part.blocks is not None and len(rows):
             stage = far_reaching(self.context)
-            arrays = {name: values[rows] for name, values in ins.items()}
-            points = points_of(stage, WHOLE_CLOUD, module, arrays)
+            points = points_of(stage, WHOLE_CLOUD, module, SomeRows(ins, rows))
             self.reduced.append(stage.reduce_points(points))
 
 
-def _concatenate_by_name(parts: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+def _concatenate_by_name(parts: Sequence[Mapping[str, NDArray]]) -> dict[str, NDArray]:
     """Return the arrays of all views together, by name."""
     return {
         name: np.concatenate([part[name] for part in parts if name in part])
@@ -315,16 +358,24 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     return lines
 
 
-def _marked(number: int, piece: Piece, unit: float, changed: ChangedValues) -> NewValues:
-    """Return new values that number a piece's points, with those that an earlier round changed."""
-    count = len(piece.index)
-    marks = {
+def _marked(
+    number: int, piece: Piece, context: RunContext, changed: ChangedValues
+) -> dict[str, NDArray]:
+    """Return dimensions that mark a piece's points, with those that an earlier round changed."""
+    count, layout = len(piece.index), piece.layout
+    columns = RecordColumns([(layout, piece.records)])
+    marks: dict[str, NDArray] = {
         ROW: np.arange(count, dtype=np.uint32),
         INPUT: np.full(count, number, np.uint32),
-        OUTSIDE: np.where(piece.away < 0, -1.0, piece.away * unit),
+        OUTSIDE: np.where(piece.away < 0, -1.0, piece.away * context.unit),
+        **selection(context.plan.where, columns),
     }
-    every = {name: (None, values) for name, values in marks.items()}
-    return NewValues(np.ones(count, bool), every | changed)
+    for name, (rows, values) in changed.items():
+        kind = values.dtype
+        out = columns[name].astype(kind) if name in columns else np.zeros(count, kind)
+        out[rows] = values
+        marks[name] = out
+    return marks
 
 
 def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[PieceResults]:
@@ -344,8 +395,7 @@ def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[Piece
         values = {
             name: np.concatenate([view[name][at] for view, at in parts])[order] for name in names
         }
-        # Old PDAL reads flags as bits of the class.
-        if flags_in_classes(piece.path) and "Classification" in values:
+        if piece.layout.is_old and "Classification" in values:  # old PDAL reads flags as bits of it
             values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
         results.append(PieceResults(piece, rows, values))
     return results
@@ -417,7 +467,7 @@ def _run_with_halo(
     side_m, halo_m, short = grid.size * context.unit, part.halo_m, False
     head: HeadResult | None = None
     for attempt in range(_MOST_WIDENINGS + 1):
-        pieces = cut_all(grid, tile, sources, halo_m / context.unit, folder)
+        pieces = cut_all(grid, tile, sources, halo_m / context.unit)
         read = sum(len(piece.index) for piece in pieces)
         points = sum(len(piece.own_rows) for piece in pieces)
         if not points or (not context.plan.head and part.blocks is None):
@@ -425,7 +475,7 @@ def _run_with_halo(
             break
         complete = inside(context.bounds, grid.box(tile, halo_m / context.unit))
         try:
-            head = _HeadRun(context, number, tile, pieces, halo_m, complete).run()
+            head = _HeadRun(context, number, tile, pieces, halo_m, complete, folder).run()
             needed_m = head.halo_needed_m
         except NoTerrainError:
             if complete:

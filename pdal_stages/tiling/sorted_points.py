@@ -7,13 +7,12 @@ removed at the end of the run.
 
 from __future__ import annotations
 
-import copy
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +20,11 @@ from numpy.typing import NDArray
 from ..base.files import whole_files
 from ..base.grid import begins_run
 from ..base.hashing import digest_of_file
-from ..pipeline.las_files import laspy_header, read_chunks
+from ..base.las_points import Layout, read_records
 from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource
 from .options import Box, TileGrid, check_number
 
-if TYPE_CHECKING:  # its import takes 0.15 CPU seconds, for which one piece need not wait
-    import laspy
-
-#: Points of a block, as many as in a LAZ chunk.
-BLOCK = 50_000
 #: What messages call the copy.
 TEMPORARY = "temporary"
 #: Points that are sorted at a time, to bound memory (not tuned).
@@ -44,23 +38,12 @@ _CELLS = 4
 _PLACE = 250.0
 
 
-def write_records(path: str, header: laspy.LasHeader, records: Iterable[NDArray]) -> None:
-    """Write points uncompressed, with the header and all records of the file that they are from."""
-    import laspy
-
-    with laspy.open(path, mode="w", header=copy.deepcopy(header), do_compress=False) as writer:
-        for block in records:
-            writer.write_points(laspy.PackedPointRecord(block, header.point_format))
-        if header.evlrs:  # of which one may be the spatial reference
-            writer.write_evlrs(header.evlrs)
-
-
 # ---- the copy, sorted by location ----------------------------------------------------------------
 
 
-def _copy_type(header: laspy.LasHeader) -> np.dtype:
+def _copy_type(layout: Layout) -> np.dtype:
     """Return the type of a point in the copy: its number in the file, and its record."""
-    return np.dtype([("number", "<i8"), ("record", header.point_format.dtype())])
+    return np.dtype([("number", "<i8"), ("record", layout.dtype)])
 
 
 def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
@@ -68,16 +51,15 @@ def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
 
     :class:`CloudIndex` parses it.
     """
-    header = laspy_header(path)
-    dtype, cells = _copy_type(header), grid.scaled(1 / _CELLS)
+    layout = Layout.of(path)
+    dtype, cells = _copy_type(layout), grid.scaled(1 / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     parts = [np.empty((0, 4), np.int64)]
     total = 0
     changed_ns, digest = os.stat(path).st_ctime_ns, digest_of_file(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
-        for points in read_chunks(path, most=_PART):
-            records = points.array
-            x, y = coordinates(records, header)
+        for records in read_records(path, layout, most=_PART):
+            x, y = layout.column(records, "X"), layout.column(records, "Y")
             low = np.minimum(low, (x.min(), y.min()))
             high = np.maximum(high, (x.max(), y.max()))
             column, line = cells.index(x), cells.index(y)
@@ -109,31 +91,21 @@ def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
     return np.column_stack([squares, points.astype(np.int64)])
 
 
-def coordinates(
-    records: NDArray, header: laspy.LasHeader
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return x and y (n,) of records (n,)."""
-    x, y = (records[name] * header.scales[k] + header.offsets[k] for k, name in enumerate("XY"))
-    return x, y
-
-
-def points_near(
-    header: laspy.LasHeader, index: CloudIndex, box: Box
-) -> tuple[NDArray[np.int64], NDArray]:
+def points_near(layout: Layout, index: CloudIndex, box: Box) -> tuple[NDArray[np.int64], NDArray]:
     """Return numbers (n,), ascending, and records (n,) of the points in a box, with its edges."""
     (i0, j0), (i1, j1) = (
         index.grid.index(np.array(corner)).tolist() for corner in (box[:2], box[2:])
     )
     i, j = index.cells[:, 0], index.cells[:, 1]
     near = index.cells[(i >= i0) & (i <= i1) & (j >= j0) & (j <= j1)]
-    dtype = _copy_type(header)
+    dtype = _copy_type(layout)
     parts = [np.empty(0, dtype)]
     with open(index.copy, "rb") as file:
         for _, _, first, count in near.tolist():
             file.seek(first * dtype.itemsize)
             parts.append(np.fromfile(file, dtype, count))
     rows = np.concatenate(parts)
-    x, y = coordinates(rows["record"], header)
+    x, y = layout.column(rows["record"], "X"), layout.column(rows["record"], "Y")
     rows = rows[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]
     rows = rows[np.argsort(rows["number"])]
     return np.ascontiguousarray(rows["number"]), np.ascontiguousarray(rows["record"])
@@ -144,10 +116,11 @@ def points_near(
 
 @dataclass
 class Piece:
-    """Points of one input in a tile and around it, in their order, as an uncompressed LAS file."""
+    """Points of one input in a tile and around it, in their order."""
 
     source: InputSource
-    path: str
+    layout: Layout
+    records: NDArray  #: (n,)
     index: NDArray[np.int64]  #: (n,) number of each point in its input file
     #: (n,) distance outside the tile along the farther axis, in the unit of the coordinates; -1
     #: inside
@@ -169,7 +142,6 @@ def cut_all(
     tile: tuple[int, int],
     sources: Sequence[InputSource],
     halo_units: float,
-    folder: str,
 ) -> list[Piece]:
     """Return the points of a tile and its halo, from every input that has any there.
 
@@ -177,18 +149,16 @@ def cut_all(
     """
     box, inner = grid.box(tile, halo_units), grid.box(tile)
     pieces = []
-    for number, source in enumerate(sources):
+    for source in sources:
         assert source.index is not None
-        header = laspy_header(source.path)
-        numbers, records = points_near(header, source.index, box)
+        layout = Layout.of(source.path)
+        numbers, records = points_near(layout, source.index, box)
         if not len(records):
             continue
-        x, y = coordinates(records, header)
+        x, y = layout.column(records, "X"), layout.column(records, "Y")
         places = np.column_stack([grid.index(x), grid.index(y)])
         away = np.maximum(inner[0] - x, x - inner[2])
         away = np.maximum(away, np.maximum(inner[1] - y, y - inner[3]))
         away = np.where((places == tile).all(axis=1), -1.0, np.maximum(away, 0.0))
-        target = os.path.join(folder, f"piece{number}.las")
-        write_records(target, header, [records])
-        pieces.append(Piece(source, target, numbers, away))
+        pieces.append(Piece(source, layout, records, numbers, away))
     return pieces

@@ -21,19 +21,21 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.grid import GridWindow
 from ..base.hashing import fingerprint
+from ..base.las_points import Layout, RecordColumns
 from ..base.messages import count_of, print_messages
 from ..base.version import build
-from ..pipeline.las_files import laspy_header
 from .inputs import InputSource, Survey
 from .jobs import Job, Store, load_arrays, save_arrays
 from .options import TileGrid, TilingOptions
 from .plan import Round, TilePlan
-from .sorted_points import coordinates, points_near
+from .sorted_points import points_near
 from .tiled_run import SurveyRun, workers_of
 
-#: Reduces the points of a tile, a path and a laspy record for each input that has any there, to
-#: arrays and figures that JSON can hold.
-Reduce = Callable[[list[tuple[str, Any]]], tuple[dict[str, NDArray], dict[str, Any]]]
+#: Points of an input: its path, and their dimensions by PDAL's names.
+Part = tuple[str, Mapping[str, NDArray]]
+#: Reduces the points of a tile, those of each input that has any there, to arrays and figures that
+#: JSON can hold.
+Reduce = Callable[[list[Part]], tuple[dict[str, NDArray], dict[str, Any]]]
 #: Column and row of a tile.
 Tile = tuple[int, int]
 #: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
@@ -195,20 +197,15 @@ def _reduce_tile(
     return figures
 
 
-def points_of_tile(
-    grid: TileGrid, tile: Tile, sources: Sequence[InputSource]
-) -> list[tuple[str, Any]]:
-    """Return the inputs with points in a tile, and these as laspy's records."""
-    import laspy
-
-    parts = []
+def points_of_tile(grid: TileGrid, tile: Tile, sources: Sequence[InputSource]) -> list[Part]:
+    """Return the inputs with points in a tile, and the dimensions of these."""
+    parts: list[Part] = []
     for source in sources:
         assert source.index is not None
-        header = laspy_header(source.path)
-        records = points_near(header, source.index, grid.box(tile))[1]
-        x, y = coordinates(records, header)
+        layout = Layout.of(source.path)
+        records = points_near(layout, source.index, grid.box(tile))[1]
+        x, y = layout.column(records, "X"), layout.column(records, "Y")
         inside = (grid.index(x) == tile[0]) & (grid.index(y) == tile[1])
         if inside.any():
-            part = records[inside], header.point_format, header.scales, header.offsets
-            parts.append((source.path, laspy.ScaleAwarePointRecord(*part)))
+            parts.append((source.path, RecordColumns([(layout, records[inside])])))
     return parts

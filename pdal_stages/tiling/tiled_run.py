@@ -21,7 +21,7 @@ from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
 from ..pipeline.json_source import Override
-from ..pipeline.las_files import files_with_flags_to_split
+from ..pipeline.pdal_facts import check_flags, check_inputs, check_units
 from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import NO_REFERENCE
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
@@ -81,7 +81,7 @@ def run_tiled(
         A KeyboardInterrupt with what was done until then.
     """
     chosen = tile if isinstance(tile, TilingOptions) else TilingOptions(tile, **options)
-    pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides, whole=False)
+    pipeline = source if isinstance(source, Pipeline) else Pipeline(source, overrides)
     plan = make_plan(pipeline, chosen.buffer)
     return run_plan(plan, chosen, dry_run=dry_run, progress=progress, pipeline=pipeline)
 
@@ -105,9 +105,10 @@ def run_plan(
     resumed = chosen.resume and chosen.tile is None
     known = Store(folder).note("run") if resumed else {}
     survey = Survey(plan, chosen, known if "square" in known else None)
-    if chosen.per == "tile":  # whose outputs have points of all readers
-        files_with_flags_to_split([*plan.readers, *plan.tail])
-    if pipeline is not None:
+    plan = replace(plan, copied=plan.copied and chosen.per == "file")
+    if not plan.copied:
+        _refuse_misread(plan, survey, chosen.per == "tile")
+    if pipeline is not None and not plan.copied:
         _try_on_an_input(pipeline, survey, len(plan.readers))
     if dry_run:
         return estimate(plan, survey)
@@ -146,6 +147,14 @@ def run_plan(
     return result
 
 
+def _refuse_misread(plan: TilePlan, survey: Survey, together: bool) -> None:
+    """Refuse inputs that PDAL would misread, `together` or one by one, before the plan's tail."""
+    readers = [{**source.reader, "filename": source.path} for source in survey.readable()]
+    for stages in [readers] if together else [[reader] for reader in readers]:
+        for check in (check_inputs, check_units, check_flags):
+            check([*stages, *plan.tail])
+
+
 def workers_of(options: TilingOptions, folder: str) -> Any:
     """Return the workers of a run whose working folder is `folder`."""
     if options.scheduler:
@@ -165,7 +174,7 @@ def _try_on_an_input(pipeline: Pipeline, survey: Survey, readers: int) -> None:
     stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
     with contextlib.suppress(DependencyError):  # the program pdal is not there to ask
         trial = replace(source, stages=[*stages, *source.stages[readers:]])
-        Pipeline(trial, whole=False, ready=pipeline.expanded.ours).prepare()
+        Pipeline(trial, ready=pipeline.expanded.ours).prepare()
 
 
 class SurveyRun:
@@ -380,9 +389,8 @@ class _Run(SurveyRun):
         plan = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
         grids, store = (survey.grid, survey.squares), self.store
         folders = str(store.scratch), str(store.kept)
-        return RunContext(
-            plan, *grids, survey.unit, survey.bounds, self.workers.threads, most, *folders
-        )
+        wkt, threads = survey.reference.wkt, self.workers.threads
+        return RunContext(plan, *grids, survey.unit, survey.bounds, threads, most, wkt, *folders)
 
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
         """Run all waiting tiles, and outputs as soon as their last tile is done.

@@ -1,12 +1,10 @@
-"""Write outputs: read points again, set the results of tiles, run the tail with its writers."""
+"""Write outputs: copies of inputs with the results of tiles, or what the tail makes of these."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,23 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base import las
-from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.las_check import check_complete
-from ..pipeline import las_files
-from ..pipeline import pdal as pdal_env
+from ..base.las_copy import LasCopy
+from ..base.las_points import Layout, read_records
+from ..pipeline.copies import copy_of, named_types
 from ..pipeline.inputs_outputs import LAS_WRITERS
-from ..pipeline.las_files import laspy_header, read_chunks
 from ..pipeline.run import execute_whole
-from ..pipeline.runtime import Callbacks
 from ..stages.points import class_counts
 from .inputs import InputSource
 from .jobs import load_arrays, written
 from .options import MOST_AT_ONCE
 from .plan import TilePlan
-from .sorted_points import BLOCK, Piece, write_records
+from .sorted_points import Piece
 
 #: PDAL's type names that are not NumPy's plus ``_t``.
 _FLOATS = {"float64": "double", "float32": "float"}
@@ -53,28 +48,7 @@ class NewValues:
     """New values for points that are read again, in their order."""
 
     kept: NDArray[np.bool_]  #: (n,) which of the points remain
-    #: New values of dimensions and the rows they belong to; None for all.
-    values: Mapping[str, tuple[NDArray[np.int64] | None, NDArray]]
-
-
-def flags_in_classes(path: str) -> bool:
-    """Return whether this PDAL reads the flags of a file (LAS 1.0-1.3) as bits of the class."""
-    return not pdal_env.splits_class_flags() and las.holds_flags(path)
-
-
-def changed_in(
-    name: str,
-    read: NDArray,
-    rows: NDArray[np.int64] | None,
-    values: NDArray,
-    holds_flags: bool,
-) -> NDArray:
-    """Return a dimension (n,) with new values in some or all rows; keep flags in the class."""
-    out = np.array(read)
-    out[slice(None) if rows is None else rows] = values
-    if name == "Classification" and holds_flags:
-        out |= read & ~np.uint8(LEGACY_LIMIT)
-    return out
+    values: Mapping[str, NDArray]  #: (n,) new values of dimensions
 
 
 def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
@@ -119,107 +93,112 @@ def read_results(
         first, last = np.searchsorted(index, (start, end))
         rows = index[first:last] - start
         kept[rows] = True
-        for field in list(points.dtype.fields or ())[1:]:
-            name = field.removeprefix("dim/")
+        for column in list(points.dtype.fields or ())[1:]:
+            name = column.removeprefix("dim/")
             if name not in values:
-                values[name] = np.zeros(end - start, points[field].dtype)
-            values[name][rows] = points[field][first:last]
+                values[name] = np.zeros(end - start, points[column].dtype)
+            values[name][rows] = points[column][first:last]
     if seen != count:
         raise StageError(
             "the tiles do not hold all points of the file",
             where=source.path,
             found=f"{seen:,} of {count:,} points. Run it again without --resume",
         )
-    return NewValues(kept, {name: (None, column) for name, column in values.items()})
+    return NewValues(kept, values)
 
 
-# ---- the tail ------------------------------------------------------------------------------------
+def result_types(tiles: Iterable[str], source: InputSource) -> dict[str, np.dtype]:
+    """Return the types of the dimensions that tiles have new values of, for points of a file."""
+    for path in tiles:
+        points = load_arrays(path, [source.key]).get(source.key)
+        if points is not None:
+            names = (points.dtype.names or ())[1:]
+            return {name.removeprefix("dim/"): points.dtype[name] for name in names}
+    return {}
+
+
+# ---- copies with new values, and the tail --------------------------------------------------------
+
+
+@dataclass
+class PointsToWrite:
+    """Points of an input in parts, with new values, and the copy of the input that gets them."""
+
+    copy: LasCopy
+    #: Yields records (n,), which of them remain (n,), and new values of dimensions.
+    parts: Iterable[tuple[NDArray, NewValues]]
+    classes: Counter[str] = field(default_factory=Counter)
+
+    def write(self, target: Path) -> None:
+        """Write the copy."""
+        with self.copy.writing_to(target):
+            for records, new in self.parts:
+                kept = new.kept
+                values = {name: column[kept] for name, column in new.values.items()}
+                self.copy.write(records if kept.all() else records[kept], values)
+                if "Classification" in values:
+                    self.classes.update(class_counts(values["Classification"]))
 
 
 def run_tail(
-    readers: list[dict[str, Any]],
-    new: list[NewValues],
-    tail: list[dict[str, Any]],
+    sets: Sequence[PointsToWrite],
+    sources: Sequence[InputSource],
+    plan: TilePlan,
     outputs: Sequence[str],
     scratch: str,
-    sources: Sequence[str],
 ) -> dict[str, Any]:
-    """Run readers, their new values, and the tail with its writers; return a record.
+    """Write copies of inputs, in one output or through the tail with its writers; return a record.
 
-    The readers read `sources`, or parts of them. The `outputs` get their names once all are
-    complete, and only while the run with the temporary folder `scratch` exists.
+    The `outputs` get their names once all are complete, and only while the run with the temporary
+    folder `scratch` exists.
     """
 
     def check() -> None:
         if not Path(scratch).is_dir():  # the run was killed, and another one may be writing here
             raise StageError("the run that this belonged to has ended", found=scratch)
 
-    flags = las_files.files_with_flags_to_split([*readers, *tail])
-    callbacks = Callbacks()
-    stages, last = read_with(callbacks, readers, new, flags)
-    stages.append({"type": "filters.merge", "inputs": [last]})
-    stages += [{k: v for k, v in stage.items() if k != "inputs"} for stage in tail]
-    run, _ = execute_whole(stages, outputs, sources, check, arrays=False)
-    return {"outputs": written(outputs), "written": run.count}
+    def complete(partial: Path, final: Path, number: int) -> None:
+        check_complete(partial, final, plan.writers[0], sets[0].copy.count)
+        check()
+
+    if plan.copied:
+        with whole_files(*outputs, check=complete) as (partial,):
+            sets[0].write(partial)
+        return _record(outputs, sets, sets[0].copy.count)
+    with TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True) as folder:
+        stages: list[dict[str, Any]] = []
+        listed: dict[str, str] = {}
+        for number, (each, source) in enumerate(zip(sets, sources, strict=True)):
+            path = Path(folder) / f"{number}.las"
+            each.write(path)
+            reader = {**source.reader, "filename": str(path), "tag": f"in{number}"}
+            stages.append({**reader, "use_eb_vlr": True})
+            listed |= named_types(Layout.of(path))
+        stages.append({"type": "filters.merge", "inputs": [stage["tag"] for stage in stages]})
+        dimensions = ",".join(f"{name}={kind}" for name, kind in listed.items())
+        for stage in plan.tail:
+            plain = {name: value for name, value in stage.items() if name != "inputs"}
+            named = plan.extra_dims is not None and stage["type"] in LAS_WRITERS and dimensions
+            stages.append({"extra_dims": dimensions, **plain} if named else plain)
+        run, _ = execute_whole(stages, outputs, check, arrays=False)
+    return _record(outputs, sets, run.count)
 
 
-def read_with(
-    callbacks: Callbacks, readers: list[dict[str, Any]], new: list[NewValues], flags: Sequence[bool]
-) -> tuple[list[dict[str, Any]], str]:
-    """Return stages that read points and set new values, and the tag of the last one.
-
-    The points of each reader stay a view of their own, in the order of the readers. One filter sets
-    the values of all: the time PDAL needs grows with the third power of the number of filters that
-    add dimensions. `flags`: of each reader, whether flags must be split from the class (old PDAL);
-    empty for none.
-    """
-    stages: list[dict[str, Any]] = []
-    last = []
-    for number, reader in enumerate(readers):
-        stages.append({**reader, "tag": f"in{number}"})
-        if flags and flags[number]:
-            splitter = las_files.flag_splitter([True], inputs=[f"in{number}"], tag=f"split{number}")
-            stages.append(splitter)
-        last.append(stages[-1]["tag"])
-    stages += _put(callbacks, new, last, [flags_in_classes(each["filename"]) for each in readers])
-    return stages, stages[-1]["tag"]
+def _record(outputs: Sequence[str], sets: Sequence[PointsToWrite], count: int) -> dict[str, Any]:
+    classes = sum((each.classes for each in sets), Counter[str]())
+    return {"outputs": written(outputs), "written": count, "classes": dict(classes)}
 
 
-def _put(
-    callbacks: Callbacks, new: Sequence[NewValues], inputs: list[str], holds_flags: list[bool]
-) -> Iterator[dict[str, Any]]:
-    """Yield filters that set new values of points, and drop some: PDAL needs two filters.
-
-    PDAL calls each for the points of one reader after the other.
-    """
-    to_put, to_drop = zip(new, holds_flags, strict=True), iter(new)
-
-    def put(module, ins, outs) -> None:
-        part, has_flags = next(to_put)
-        if len(ins["X"]) != len(part.kept):
-            raise StageError(f"a reader gave {len(ins['X']):,} points of {len(part.kept):,}")
-        for name, (rows, values) in part.values.items():
-            outs[name] = changed_in(name, ins[name], rows, values, has_flags)
-
-    def drop(module, ins, outs) -> None:
-        outs["Mask"] = np.ascontiguousarray(next(to_drop).kept, bool)
-
-    types = {name: v.dtype.name for part in new for name, (_, v) in part.values.items()}
-    adds = {name: _FLOATS.get(kind, f"{kind}_t") for name, kind in types.items()}
-    yield callbacks.filter(put, adds, inputs=inputs, tag="put")
-    if not all(part.kept.all() for part in new):
-        yield callbacks.filter(drop, inputs=["put"], tag="left")
-
-
-def with_dimensions(
-    tail: list[dict[str, Any]], extra_dims: Mapping[str, str] | None, paths: list[str]
-) -> list[dict[str, Any]]:
-    """Return a tail whose LAS writers list extra dimensions: the inputs' and `extra_dims`."""
-    listed = "" if extra_dims is None else las_files.extra_dims_option(paths, extra_dims)
-    return [
-        {"extra_dims": listed, **stage} if listed and stage["type"] in LAS_WRITERS else stage
-        for stage in tail
-    ]
+def _copy(
+    source: InputSource, layout: Layout, plan: TilePlan, target: str, types: Mapping[str, np.dtype]
+) -> LasCopy:
+    """Return a copy of an input with the dimensions of a plan; `types` are those of new values."""
+    added = dict(plan.makes if plan.extra_dims is None else plan.extra_dims)
+    if plan.creates is None:  # PDAL's filters may have made others, in between
+        named = {name: _FLOATS.get(kind.name, f"{kind.name}_t") for name, kind in types.items()}
+        added = {name: kind for name, kind in named.items() if name not in layout.names} | added
+    added.pop("Classification", None)
+    return copy_of(source.path, layout, target, added, source.reader)
 
 
 # ---- an output for each input file ---------------------------------------------------------------
@@ -232,76 +211,26 @@ def write_file(
     outputs: list[str],
     scratch: str,
 ) -> dict[str, Any]:
-    """Write a file's outputs from the results of its tiles; return the record with class counts."""
+    """Write the outputs of a file from the results of its tiles; return the record.
+
+    It has class counts.
+    """
     assert source.index is not None
-    count = source.index.count
-    tail = with_dimensions(plan.tail, plan.extra_dims, [source.path])
-    writer, names = plan.writers[0], [Path(path).suffix.lower() for path in outputs]
-    plain = writer["type"] == "writers.las" and "auto" not in map(str, writer.values())
-    if (
-        count > MOST_AT_ONCE and plain and names in ([".las"], [".laz"])
-    ):  # all parts have the same header
-        return _in_parts(source, count, results, tail, outputs, scratch)
-    new = read_results(results, source, count, 0, count)
-    if not count:  # no tile has results, so the dimensions come from the plan
-        types = plan.makes.items()
-        new = NewValues(
-            new.kept, {name: (None, np.empty(0, las.number_type(kind))) for name, kind in types}
-        )
-    reader = {**source.reader, "filename": source.path}
-    return run_tail([reader], [new], tail, outputs, scratch, [source.path]) | {
-        "classes": _classes(new)
-    }
+    count, layout = source.index.count, Layout.of(source.path)
 
+    def parts() -> Iterator[tuple[NDArray, NewValues]]:
+        for start in range(0, count, MOST_AT_ONCE):
+            end = min(count, start + MOST_AT_ONCE)
+            new, at = read_results(results, source, count, start, end), 0
+            for records in read_records(source.path, layout, start, end):
+                rows = slice(at, at + len(records))
+                values = {name: column[rows] for name, column in new.values.items()}
+                yield records, NewValues(new.kept[rows], values)
+                at += len(records)
 
-def _in_parts(
-    source: InputSource,
-    points: int,
-    results: list[str],
-    tail: list[dict[str, Any]],
-    outputs: list[str],
-    scratch: str,
-) -> dict[str, Any]:
-    """Run the tail on each part of a file, and join the results under the first one's header."""
-    import laspy
-
-    classes: Counter[str] = Counter()
-    out: Any = None
-    count = 0
-    tail = [{k: v for k, v in stage.items() if k != "compression"} for stage in tail]
-
-    def check(partial: Path, final: Path, number: int) -> None:
-        check_complete(partial, final, {"type": "writers.las", "filename": final}, count)
-
-    with whole_files(*outputs, check=check) as (partial,), contextlib.ExitStack() as stack:
-        folder = stack.enter_context(TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True))
-        piece, part = (os.path.join(folder, name) for name in ("part.las", "out.las"))
-        for start in range(0, points, MOST_AT_ONCE):
-            end = min(points, start + MOST_AT_ONCE)
-            chunks = read_chunks(source.path, start, end, BLOCK)
-            write_records(piece, laspy_header(source.path), (points.array for points in chunks))
-            new = read_results(results, source, points, start, end)
-            reader = {**source.reader, "filename": piece}
-            run_tail([reader], [new], tail, [part], scratch, [source.path])
-            classes.update(_classes(new))
-            with laspy.open(part) as points_of_part:
-                if out is None:
-                    how = {
-                        "header": points_of_part.header,
-                        "do_compress": partial.suffix.lower() == ".laz",
-                    }
-                    out = stack.enter_context(laspy.open(partial, mode="w", **how))
-                for chunk in points_of_part.chunk_iterator(BLOCK):
-                    out.write_points(chunk)
-                count += int(points_of_part.header.point_count)
-        if out.header.evlrs:
-            out.write_evlrs(out.header.evlrs)
-    return {"outputs": written(outputs), "written": count, "classes": dict(classes)}
-
-
-def _classes(new: NewValues) -> dict[str, int]:
-    _, codes = new.values.get("Classification", (None, np.zeros(len(new.kept), np.uint8)))
-    return class_counts(codes[new.kept]) if "Classification" in new.values else {}
+    types = result_types(results, source)
+    copy = _copy(source, layout, plan, outputs[0] if plan.copied else ".las", types)
+    return run_tail([PointsToWrite(copy, parts())], [source], plan, outputs, scratch)
 
 
 def write_tile(
@@ -311,13 +240,11 @@ def write_tile(
     results = [result for result in results if result.piece.own_rows.size]
     if not results:
         return {"outputs": []}
-    sources = [result.piece.source.path for result in results]
-    tail = with_dimensions(plan.tail, plan.extra_dims, sources)
-    readers = [{**result.piece.reader, "filename": result.piece.path} for result in results]
-    new = []
+    sets = []
     for result in results:  # only the tile's own points remain
-        kept = np.zeros(len(result.piece.index), bool)
-        kept[result.rows] = True
-        values = {name: (result.rows, column) for name, column in result.values.items()}
-        new.append(NewValues(kept, values))
-    return run_tail(readers, new, tail, outputs, scratch, sources)
+        piece = result.piece
+        new = NewValues(np.ones(len(result.rows), bool), result.values)
+        types = {name: values.dtype for name, values in result.values.items()}
+        copy = _copy(piece.source, piece.layout, plan, ".las", types)
+        sets.append(PointsToWrite(copy, [(piece.records[result.rows], new)]))
+    return run_tail(sets, [result.piece.source for result in results], plan, outputs, scratch)

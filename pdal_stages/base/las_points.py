@@ -1,0 +1,486 @@
+"""Points of LAS and LAZ files as dimensions, under the names that PDAL gives them.
+
+Records are read as bytes, with lazrs where they are compressed. Which bits of a record are which
+dimension is told by tables (LAS 1.4 R15, tables 7 to 18 and 24). No name is a pattern, and bytes
+that nobody describes stay what they are.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+import os
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import StageError
+from .las import POINT_BYTES, POINTWISE, LasHeader, laszip_record, read_header, records_of
+
+#: Points read at a time: 30 to 70 MB as LAS stores them.
+PART = 1_000_000
+#: Bytes of a description of extra bytes.
+ENTRY = 192
+#: Most descriptions that one record holds.
+MOST_ENTRIES = 65_535 // ENTRY
+#: Types of extra bytes 1 to 10; 11 to 20 are pairs, 21 to 30 triples of these.
+TYPES = tuple(map(np.dtype, ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")))
+#: Bit of a description's options: there is a scale.
+_SCALED = 8
+#: Bit of a description's options: there is an offset.
+_SHIFTED = 16
+#: Bytes at which a description has its scales and its offsets.
+_NUMBERS = (112, 136)
+
+_COORDINATES = [("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("Intensity", "<u2"), ("returns", "u1")]
+#: Fields of a point of formats 0 to 5, and of 6 to 10, in their order.
+_OLD = [*_COORDINATES, ("class", "u1"), ("ScanAngleRank", "i1"), ("UserData", "u1"),
+        ("PointSourceId", "<u2")]  # fmt: skip
+_NEW = [*_COORDINATES, ("flags", "u1"), ("class", "u1"), ("UserData", "u1"),
+        ("ScanAngleRank", "<i2"), ("PointSourceId", "<u2"), ("GpsTime", "<f8")]  # fmt: skip
+_TIME = [("GpsTime", "<f8")]
+_COLORS = [("Red", "<u2"), ("Green", "<u2"), ("Blue", "<u2")]
+_INFRARED = [("Infrared", "<u2")]
+_WAVE = [("waveform", "V29")]
+#: Fields that follow, by point format.
+_MORE: tuple[list[tuple[str, str]], ...] = (
+    *([], _TIME, _COLORS, _TIME + _COLORS, _TIME + _WAVE, _TIME + _COLORS + _WAVE),
+    *([], _COLORS, _COLORS + _INFRARED, _WAVE, _COLORS + _INFRARED + _WAVE),
+)
+#: Dimensions that are bits of a field: its name, the lowest bit and the number of bits.
+_OLD_BITS = {
+    "ReturnNumber": ("returns", 0, 3),
+    "NumberOfReturns": ("returns", 3, 3),
+    "ScanDirectionFlag": ("returns", 6, 1),
+    "EdgeOfFlightLine": ("returns", 7, 1),
+    "Classification": ("class", 0, 5),
+    "Synthetic": ("class", 5, 1),
+    "KeyPoint": ("class", 6, 1),
+    "Withheld": ("class", 7, 1),
+}
+_NEW_BITS = {
+    "ReturnNumber": ("returns", 0, 4),
+    "NumberOfReturns": ("returns", 4, 4),
+    "ClassFlags": ("flags", 0, 4),
+    "Synthetic": ("flags", 0, 1),
+    "KeyPoint": ("flags", 1, 1),
+    "Withheld": ("flags", 2, 1),
+    "Overlap": ("flags", 3, 1),
+    "ScanChannel": ("flags", 4, 2),
+    "ScanDirectionFlag": ("flags", 6, 1),
+    "EdgeOfFlightLine": ("flags", 7, 1),
+    "Classification": ("class", 0, 8),
+}
+#: Degrees of a step of the scan angle in formats 6 to 10.
+_ANGLE_STEP = 0.006
+#: What lazrs must decode of LAZ 1.4 for a field, beside X, Y and the returns, by its names.
+_LAYERS = {
+    "Z": "Z", "Intensity": "INTENSITY", "flags": "FLAGS", "class": "CLASSIFICATION",
+    "UserData": "USER_DATA", "ScanAngleRank": "SCAN_ANGLE", "PointSourceId": "POINT_SOURCE_ID",
+    "GpsTime": "GPS_TIME", "Red": "RGB", "Green": "RGB", "Blue": "RGB", "Infrared": "NIR",
+    "extra": "ALL_EXTRA_BYTES", "waveform": "WAVEPACKET",
+}  # fmt: skip
+
+
+class ExtraField(NamedTuple):
+    """Extra bytes that are one dimension."""
+
+    name: str  #: in the file; an element of an array has its number behind it
+    at: int  #: byte of the extra bytes at which it begins
+    type: np.dtype
+    scale: float = 1.0
+    shift: float = 0.0
+
+    @property
+    def is_scaled(self) -> bool:
+        """Return whether its values are numbers times a scale, plus an offset."""
+        return self.scale != 1.0 or self.shift != 0.0
+
+
+def decode_text(field: bytes) -> str:
+    """Return a text of a record, in UTF-8 or, as older programs write it, in Latin-1."""
+    text = field.split(b"\0")[0]
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        return text.decode("latin-1")
+
+
+def size_of_entry(entry: bytes) -> int:
+    """Return how many bytes of a point a description is about; StageError for no known type."""
+    kind = entry[2]
+    if kind > 30:
+        what = "the LAS file is damaged: its extra bytes are of no known type"
+        raise StageError(what, found=kind)
+    # Of bytes without a type the options are the number.
+    return ((kind - 1) // 10 + 1) * TYPES[(kind - 1) % 10].itemsize if kind else entry[3]
+
+
+def entries_of(data: bytes) -> list[bytes]:
+    """Return the descriptions in a record of extra bytes."""
+    return [data[at : at + ENTRY] for at in range(0, len(data) - ENTRY + 1, ENTRY)]
+
+
+def extra_fields(header: LasHeader, data: bytes) -> list[ExtraField]:
+    """Return the dimensions that descriptions of extra bytes name.
+
+    Raises
+    ------
+    StageError
+        Where they do not fit the points.
+    """
+    fields, at = [], 0
+    for entry in entries_of(data):
+        count, name = (entry[2] - 1) // 10 + 1, decode_text(entry[4:36])
+        size = size_of_entry(entry)
+        for n in range(count if entry[2] else 0):
+            kind = TYPES[(entry[2] - 1) % 10]
+            scale, shift = (struct.unpack_from("<d", entry, byte + 8 * n)[0] for byte in _NUMBERS)
+            scale = scale if entry[3] & _SCALED else 1.0
+            shift = shift if entry[3] & _SHIFTED else 0.0
+            title = name if count == 1 else f"{name}{n}"
+            fields.append(ExtraField(title, at + n * kind.itemsize, kind, scale, shift))
+        at += size
+    room = header.point_bytes - POINT_BYTES[header.point_format]
+    if at > room:
+        raise StageError(
+            "the LAS file is damaged: its points are shorter than the descriptions of their "
+            "extra bytes",
+            found=f"{at:,} bytes described, {room:,} there",
+        )
+    return fields
+
+
+def description(path: str | os.PathLike) -> bytes:
+    """Return the descriptions of a file's extra bytes, of all its records; empty without any."""
+    return b"".join(
+        b"".join(entries_of(data)) for r, data in records_of(path, b"LASF_Spec") if r.number == 4
+    )
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the dimensions of a file's points stand in their records."""
+
+    header: LasHeader
+    extra: tuple[ExtraField, ...] = ()
+
+    @classmethod
+    def of(cls, path: str | os.PathLike) -> Layout:
+        """Return the layout of a file; StageError where it has none."""
+        header = read_header(path)
+        if header is None:
+            raise StageError("the input is not a LAS or LAZ file", where=str(path))
+        if header.point_format >= len(POINT_BYTES):
+            found = f"point format {header.point_format}"
+            raise StageError("its point format is not known", where=str(path), found=found)
+        return cls(header, tuple(extra_fields(header, description(path))))
+
+    @cached_property
+    def dtype(self) -> np.dtype:
+        """Return the type of a record."""
+        fields = (_OLD if self.is_old else _NEW) + _MORE[self.header.point_format]
+        room = self.header.point_bytes - POINT_BYTES[self.header.point_format]
+        return np.dtype([*fields, ("extra", f"V{room}")] if room else fields)
+
+    @property
+    def is_old(self) -> bool:
+        """Return whether flags share a byte with the class, as in point formats 0 to 5."""
+        return self.header.point_format <= 5
+
+    @cached_property
+    def _bits(self) -> dict[str, tuple[str, int, int]]:
+        return _OLD_BITS if self.is_old else _NEW_BITS
+
+    @cached_property
+    def own(self) -> dict[str, ExtraField]:
+        """Return extra dimensions by name, but those that are named like one of the format."""
+        taken = {*self._bits, *(self.dtype.names or ())}
+        return {each.name: each for each in self.extra if each.name and each.name not in taken}
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Return all dimensions."""
+        fields = [name for name in self.dtype.names or () if name[0].isupper()]
+        return [*fields, *self._bits, *self.own]
+
+    def type_of(self, name: str) -> np.dtype:
+        """Return the type of a dimension's values."""
+        if name in "XYZ":
+            return np.dtype(float)
+        if name in self.own:
+            each = self.own[name]
+            return np.dtype(float) if each.is_scaled else each.type.newbyteorder("=")
+        if name == "ScanAngleRank":
+            return np.dtype(np.float32)
+        return np.dtype("u1") if name in self._bits else self.dtype[name].newbyteorder("=")
+
+    def column(self, records: NDArray, name: str) -> NDArray:
+        """Return a dimension (n,) of records (n,); KeyError for an unknown one."""
+        if name in self._bits:
+            field, low, count = self._bits[name]
+            return records[field] >> np.uint8(low) & np.uint8((1 << count) - 1)
+        if name in self.own:
+            each = self.own[name]
+            raw = extra_bytes(records)[:, each.at : each.at + each.type.itemsize]
+            values = np.ascontiguousarray(raw).view(each.type)[:, 0]
+            if each.is_scaled:
+                return values * each.scale + each.shift
+            return values.astype(self.type_of(name), copy=False)
+        if name not in (self.dtype.names or ()) or not name[0].isupper():
+            raise KeyError(name)
+        values = records[name]
+        if name in "XYZ":
+            axis = "XYZ".index(name)
+            return values * self.header.scales[axis] + self.header.offsets[axis]
+        if name == "ScanAngleRank" and not self.is_old:
+            values = values * _ANGLE_STEP
+        return values.astype(self.type_of(name))
+
+    def put(self, records: NDArray, name: str, values: NDArray) -> None:
+        """Set a dimension (n,) of records (n,); a value that does not fit is cut off."""
+        if name in self.own:
+            each = self.own[name]
+            steps = np.rint((values - each.shift) / each.scale) if each.is_scaled else values
+            raw = extra_bytes(records)[:, each.at : each.at + each.type.itemsize]
+            raw[:] = np.ascontiguousarray(steps, each.type).view(np.uint8).reshape(raw.shape)
+        elif name in self._bits:
+            field, low, count = self._bits[name]
+            mask = np.uint8(((1 << count) - 1) << low)
+            new = np.asarray(values).astype(np.uint8) << np.uint8(low) & mask
+            records[field] = records[field] & ~mask | new
+        elif name in "XYZ":
+            axis = "XYZ".index(name)
+            steps = (values - self.header.offsets[axis]) / self.header.scales[axis]
+            records[name] = np.rint(steps)
+        elif name == "ScanAngleRank" and not self.is_old:
+            records[name] = np.rint(values / _ANGLE_STEP)
+        else:
+            records[name] = values
+
+    def layers(self, names: Iterable[str]) -> set[str]:
+        """Return what lazrs must decode for some dimensions."""
+        fields = {self._bits[n][0] if n in self._bits else n for n in names}
+        fields = {"extra" if name in self.own else name for name in fields}
+        return {_LAYERS[name] for name in fields if name in _LAYERS}
+
+
+def layout_there(path: str | os.PathLike) -> Layout | None:
+    """Return the layout of a LAS file; None where it cannot be read, which reading reports."""
+    try:
+        return Layout.of(path)
+    except (OSError, ValueError, IndexError, StageError):
+        return None
+
+
+def extra_bytes(records: NDArray) -> NDArray[np.uint8]:
+    """Return the extra bytes (n, bytes) of records (n,), as a view."""
+    size = records.dtype["extra"].itemsize
+    return bytes_of(records)[:, -size:]
+
+
+def bytes_of(records: NDArray) -> NDArray[np.uint8]:
+    """Return the bytes (n, bytes) of records (n,), as a view."""
+    return records.view(np.uint8).reshape(len(records), records.dtype.itemsize)
+
+
+# ---- reading -------------------------------------------------------------------------------------
+
+
+def read_records(
+    path: str | os.PathLike,
+    layout: Layout,
+    start: int = 0,
+    end: int | None = None,
+    most: int = PART,
+    only: Sequence[str] | None = None,
+) -> Iterator[NDArray]:
+    """Yield the records of a LAS or LAZ file from one number to another.
+
+    Parameters
+    ----------
+    path : path
+    layout : Layout
+        Of the file.
+    start, end : int
+        Numbers of the first point and of the one after the last; by default all are read.
+    most : int
+        Records of each part.
+    only : sequence of str, optional
+        Dimensions that are needed: LAZ 1.4 compresses them separately, so skipping the others
+        saves time. Those are zero then.
+
+    Raises
+    ------
+    StageError
+        If the file is cut short or cannot be decoded.
+    """
+    at, what = start, "the input cannot be read"
+    end = layout.header.count if end is None else end
+    try:
+        with open(path, "rb") as file:
+            what = "the input is damaged"
+            for part in _parts(file, layout, start, end, most, only):
+                at += len(part)
+                yield part
+    except (GeneratorExit, KeyboardInterrupt, MemoryError):
+        raise
+    except BaseException as error:  # the decompressor's panics are no Exceptions
+        reason: object = f"{type(error).__name__} at point {at:,}: {error}"
+        reason = error if isinstance(error, OSError) else reason
+        raise StageError(what, where=str(path), found=reason) from None
+    if at < end:
+        found = f"{at:,} of {end:,} points"
+        raise StageError("the input is cut short", where=str(path), found=found)
+
+
+def _parts(
+    file: Any, layout: Layout, start: int, end: int, most: int, only: Sequence[str] | None
+) -> Iterator[NDArray]:
+    """Yield the records of an open file."""
+    header, dtype = layout.header, layout.dtype
+    if not header.compressed:
+        file.seek(header.offset + start * dtype.itemsize)
+        while start < end and len(part := np.fromfile(file, dtype, min(most, end - start))):
+            start += len(part)
+            yield part
+        return
+    import lazrs
+
+    coding = laszip_record(file, header)
+    layers = ["ALL"] if only is None else ["XY_RETURNS_CHANNEL", *layout.layers(only)]
+    bits = [getattr(lazrs, f"SELECTIVE_DECOMPRESS_{layer}") for layer in layers]
+    selection = lazrs.DecompressionSelection(functools.reduce(operator.or_, bits))
+    if lazrs.LazVlr(coding).item_size() != dtype.itemsize:
+        raise ValueError(f"points of {lazrs.LazVlr(coding).item_size()} bytes in compressed form")
+    alone = coding.startswith(POINTWISE)  # points compressed one by one
+    kind = lazrs.LasZipDecompressor if alone else lazrs.ParLasZipDecompressor
+    file.seek(header.offset)
+    decoder = kind(file, coding, selection)
+    if start:
+        decoder.seek(start)
+    while start < end:
+        part = np.empty(min(most, end - start), dtype)
+        decoder.decompress_many(part.view(np.uint8))
+        start += len(part)
+        yield part
+
+
+#: Dimensions that are read together, since most stages want them.
+USUAL = ("X", "Y", "Z", "Classification", "ReturnNumber", "NumberOfReturns", "Withheld", "Overlap")
+
+
+@dataclass(eq=False)
+class LasColumns(Mapping[str, NDArray]):
+    """The dimensions of a file by name, each read when it is asked for and then kept."""
+
+    path: str
+    layout: Layout
+    _read: dict[str, NDArray] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> NDArray:
+        """Return a dimension (n,)."""
+        if name not in self._read:
+            if name not in self.layout.names:
+                raise KeyError(name)
+            wanted = USUAL if name in USUAL and not self._read.keys() & {*USUAL} else (name,)
+            self.load([each for each in wanted if each in self.layout.names])
+        return self._read[name]
+
+    def load(self, names: Sequence[str]) -> None:
+        """Read dimensions, all in one pass."""
+        count = self.layout.header.count
+        new = {name: np.empty(count, self.layout.type_of(name)) for name in names}
+        at = 0
+        for records in read_records(self.path, self.layout, only=names):
+            for name, values in new.items():
+                values[at : at + len(records)] = self.layout.column(records, name)
+            at += len(records)
+        self._read |= new
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Free the memory of dimensions; they are read again if they are asked for."""
+        for name in names:
+            self._read.pop(name, None)
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self.layout.names)
+
+    def __len__(self) -> int:
+        """Return the number of dimensions."""
+        return len(self.layout.names)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a dimension, without reading it."""
+        return name in self.layout.names
+
+
+@dataclass(eq=False)
+class SomeRows(Mapping[str, NDArray]):
+    """Dimensions of some points, each taken when it is asked for."""
+
+    columns: Mapping[str, NDArray]
+    rows: NDArray[np.int64]
+
+    def __getitem__(self, name: str) -> NDArray:
+        """Return a dimension (n,)."""
+        return self.columns[name][self.rows]
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        """Return the number of dimensions."""
+        return len(self.columns)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a dimension, without taking it."""
+        return name in self.columns
+
+
+@dataclass(eq=False)
+class RecordColumns(Mapping[str, NDArray]):
+    """The dimensions of records of several files together, by name; 0 where a file has none."""
+
+    parts: Sequence[tuple[Layout, NDArray]]
+    _made: dict[str, NDArray] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> NDArray:
+        """Return a dimension (n,)."""
+        if name not in self._made:
+            if name not in self:
+                raise KeyError(name)
+            there = [layout.type_of(name) for layout, _ in self.parts if name in layout.names]
+            kind = np.result_type(*there)
+            self._made[name] = np.concatenate(
+                [
+                    layout.column(records, name).astype(kind, copy=False)
+                    if name in layout.names
+                    else np.zeros(len(records), kind)
+                    for layout, records in self.parts
+                ]
+            )
+        return self._made[name]
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return list(dict.fromkeys(name for layout, _ in self.parts for name in layout.names))
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        """Return the number of dimensions."""
+        return len(self._names)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a dimension, without making it."""
+        return name in self._names
