@@ -195,6 +195,19 @@ def test_one_strip_without_times_and_ground(tmp_path):
     assert "Control points" not in page
 
 
+@pytest.mark.parametrize("count", [1, 40])
+def test_a_point_and_a_line(count, tmp_path):
+    las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    las.x = np.arange(count) * 30.0 + 1000
+    las.y = las.z = np.full(count, 10.0)
+    las.write(str(tmp_path / "line.las"))
+    result = write_report(
+        [str(tmp_path / "line.las")], str(tmp_path / "r.html"), density=1.0, progress=False
+    )
+    assert result["survey"]["points"] == count and result["density"]["all"]["median"] is None
+    assert "too small to" in (tmp_path / "r.html").read_text()
+
+
 def test_bad_input(cloud, tmp_path):
     for text, match in (("x,y,z\n1,2,3\n1,2\n", "line 3"), ("", "no control points")):
         (tmp_path / "c.csv").write_text(text)

@@ -19,7 +19,7 @@ from ..pipeline.inputs_outputs import input_files
 from ..tiling.inputs import Survey
 from ..tiling.options import Density, TilingOptions
 from ..tiling.tile_records import RecordRun, Tile, earlier_layout, plan_of_records, record_run
-from .cells import STEPS, CellDensity, SurfaceOptions, reduce_points
+from .cells import CellDensity, SurfaceOptions, reduce_points
 from .geotiff import write_rasters
 from .rasters import RASTERS, TileCells, compute_tile
 
@@ -29,6 +29,7 @@ class CellSurvey(Survey):
 
     def __init__(
         self,
+        name: str,
         files: Sequence[str],
         folder: Path,
         tiling: TilingOptions,
@@ -36,7 +37,7 @@ class CellSurvey(Survey):
     ) -> None:
         """Find and check the inputs, and choose tiles."""
         self.cell_options = cell_options
-        plan = plan_of_records("surfaces", files)
+        plan = plan_of_records(name, files)
         super().__init__(plan, tiling, earlier_layout(folder, tiling))
 
     def measure_density(self) -> Density:
@@ -82,7 +83,7 @@ def write_surfaces(
     place = Path(folder)
     paths = {name: place / f"{name}.tif" for name in RASTERS}
     options, chosen = options or SurfaceOptions(), replace(tiling or TilingOptions(), per="tile")
-    survey = CellSurvey(files, place, chosen, options)
+    survey = CellSurvey("surfaces", files, place, chosen, options)
     place.mkdir(parents=True, exist_ok=True)
     check_outputs([Output(str(path), "raster") for path in paths.values()], files)
     with record_run(survey, chosen, place, progress) as run:
@@ -103,8 +104,7 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> dic
     window = enclose(GridWindow(*job.record["window"]) for job in reduced)
     size = options.resolution
     x0, y0, wide, tall = (number * size for number in window)
-    in_steps = x0 * STEPS, y0 * STEPS, (x0 + wide) * STEPS, (y0 + tall) * STEPS
-    cells = TileCells(options, survey.grid, survey.unit, in_steps, {})
+    cells = TileCells(options, survey.grid, survey.unit, window, {})
     centers = x0 + size / 2, y0 + size / 2, x0 + wide - size / 2, y0 + tall - size / 2
 
     def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Any]:

@@ -35,13 +35,19 @@ class TileCells:
     options: SurfaceOptions
     grid: TileGrid
     unit: float  #: meters per unit of the coordinates
-    bounds: Box  #: of all points, in steps
+    window: GridWindow  #: the cells of the survey
     files: Mapping[Tile, str]  #: the arrays of the tiles around one
 
     @property
     def reach(self) -> float:
         """Return how far around a tile ground points matter, in the unit of the coordinates."""
         return 2 * self.options.max_radius / self.unit
+
+    @property
+    def bounds(self) -> Box:
+        """Return the box of all points, in steps."""
+        x0, y0, wide, tall = (number * self.options.step for number in self.window)
+        return x0, y0, x0 + wide, y0 + tall
 
     def load(self, box: Box, names: tuple[str, ...]) -> list[dict[str, NDArray]]:
         """Return some arrays of the tiles that share a point with a box, in steps."""
@@ -83,14 +89,17 @@ def compute_tile(cells: TileCells, tile: Tile, target: str) -> dict[str, Any]:
     no height; ``window`` tells which cells they are.
     """
     options = cells.options
-    window = cells_in_tile(cells.grid, tile, options.resolution)
+    window = cells_in_tile(cells.grid, tile, options.resolution).intersect(cells.window)
     arrays = {name: np.empty((0, 0)) for name in RASTERS}
     if window.width and window.height:
         terrain = _terrain(cells, window)
         reach = options.fill / cells.unit / options.resolution
         around = window.padded(2 * math.ceil(reach) + 2)
         inner = window.slices_in(around)
-        top, solid = (fill(level, terrain, inner, reach) for level in cells.highest(around))
+        highest, below_wires = cells.highest(around)
+        top = solid = fill(highest, terrain, inner, reach)
+        if not np.array_equal(highest, below_wires):
+            solid = fill(below_wires, terrain, inner, reach)
         canopy = np.maximum(solid - terrain, 0.0)  # NaN stays
         arrays = {"terrain": terrain, "surface": top, "canopy": canopy}
     rounded = {name: np.round(values, 3).astype(np.float32) for name, values in arrays.items()}

@@ -49,6 +49,7 @@ class Rasters:
 def render_report(result: Mapping[str, Any], rasters: Rasters) -> str:
     """Return the page."""
     top, side = rasters.of["picture"][1], rasters.rules.picture
+    top = np.pad(top, 1, constant_values=EMPTY)  # a single row has no slope to be shaded
     away, at = ndimage.distance_transform_edt(top == EMPTY, return_indices=True)
     known, top = away < _GAP, top[tuple(at)]
     z = np.where(known, (top >> 8) / STEPS, np.nan) * rasters.rules.vertical

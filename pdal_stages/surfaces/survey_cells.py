@@ -167,8 +167,11 @@ def compare_strips(files: list[str], window: GridWindow, rules: ReportRules, tar
     height minus the other's in steps, and the number of cells; ``cells`` (m, 4): column and row of
     a cell of density, sum of squares, and number of differences.
     """
-    around = window.padded(1)
     rows = np.concatenate([load_arrays(name, ("strips",))["strips"] for name in files])
+    rows = rows[window.padded(1).contains(rows[:, 1], rows[:, 2])]
+    held = GridWindow.enclosing(rows[:, 1], rows[:, 2]) if len(rows) else GridWindow(0, 0, 0, 0)
+    window = window.intersect(held)  # a tile may be much wider than its points
+    around = window.padded(1)
     rows = rows[around.contains(rows[:, 1], rows[:, 2])]
     cell = around.flat_index(rows[:, 1], rows[:, 2])
     mean = _means(rows, cell, around)

@@ -20,19 +20,16 @@ from ..base.files import HTML, JSON, Output, check_outputs, write_json, write_wh
 from ..base.grid import GridWindow
 from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
-from ..tiling.inputs import Survey
 from ..tiling.jobs import Job
 from ..tiling.options import TilingOptions
 from ..tiling.tile_records import (
     RecordRun,
     Tile,
     cells_in_tile,
-    earlier_layout,
-    plan_of_records,
     record_run,
 )
-from .cells import EMPTY, STEPS, lowest
-from .make_surfaces import enclose
+from .cells import EMPTY, STEPS, SurfaceOptions, lowest
+from .make_surfaces import CellSurvey, enclose
 from .report_page import Rasters, render_report
 from .survey_cells import ReportRules, combine, compare_strips, figures_of, reduce_for_report
 from .triangulation import heights_at
@@ -88,7 +85,7 @@ def write_report(
     files = input_files(inputs)
     check_outputs(outputs, [*files, *([control] if control else [])])
     chosen, folder = replace(tiling or TilingOptions(), per="tile"), Path(page).absolute().parent
-    survey = Survey(plan_of_records("report", files), chosen, earlier_layout(folder, chosen))
+    survey = CellSurvey("report", files, folder, chosen, SurfaceOptions())
     with record_run(survey, chosen, folder, progress) as run:
         result, rasters = _measure(run, density, void, points)
     write_whole(page, render_report(result, rasters).encode(errors="backslashreplace"), "report")
