@@ -22,12 +22,7 @@ from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.jobs import Job
 from ..tiling.options import TilingOptions
-from ..tiling.tile_records import (
-    RecordRun,
-    Tile,
-    cells_in_tile,
-    record_run,
-)
+from ..tiling.tile_records import RecordRun, Tile, cells_in_tile, record_run
 from .cells import EMPTY, STEPS, SurfaceOptions, lowest
 from .make_surfaces import CellSurvey, enclose
 from .report_page import Rasters, render_report
