@@ -335,6 +335,22 @@ def test_objects_have_the_same_heights_whichever_way(tmp_path, run, run_job, wri
     assert 3 < np.percentile(written.HeightAboveGround, 99) < np.ptp(z)
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_kilometers_and_millimeters_up_are_doubted(tmp_path, run, write_las, scale):
+    """A wood of 8 m, 1,500 m above the sea, whose heights are no meters."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 60, (2, 40_000))
+    second = np.arange(40_000) % 2
+    z = scale * (1500 + np.where(second, 0.0, rng.uniform(0, 8, 40_000)))
+    returns = {"ReturnNumber": 1 + second, "NumberOfReturns": np.full(40_000, 2)}
+    arrays = {"X": x + 5e5, "Y": y + 5e6, "Z": z, **returns}
+    source = write_las(tmp_path / "in.las", arrays, 1)
+    code, _, err = run("classify", source, tmp_path / "out.las")
+    assert code == 0 and "the unit of z may be wrong" in err, err
+    noise = np.isin(laspy.read(tmp_path / "out.las").classification, (7, 18))
+    assert noise.mean() < 0.5
+
+
 def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las):
     """A wood of 40 m in feet; with a reference that names the heights' system all is well."""
     rng = np.random.default_rng(0)

@@ -11,6 +11,7 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.units import (
     Units,
     doubt_vertical_unit,
+    is_too_flat,
     parse_wkt,
     units_of_wkt,
 )
@@ -60,6 +61,13 @@ def test_land_in_the_sky_doubts_the_unit_of_z():
     none = np.zeros(0)
     assert "above or below the sea" in doubt_vertical_unit(none, 0.0, 1.0, 1_200_000.0)
     assert not doubt_vertical_unit(none, 0.0, 1.0, 8_849.0)
+
+
+def test_a_wood_that_is_flat_doubts_the_unit_of_z():
+    wood, returns = np.linspace(0, 40, 5000), np.tile([1, 2], 2500)
+    assert is_too_flat(wood / 1000, returns)
+    assert not is_too_flat(wood, returns) and not is_too_flat(wood / 1000, np.ones(5000))
+    assert "several returns" in doubt_vertical_unit(np.zeros(0), 0.0, 1.0, too_flat=True)
 
 
 @pytest.mark.parametrize(

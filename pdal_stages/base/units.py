@@ -57,11 +57,20 @@ class UnitDoubts:
     median_slope: float = 1.5
     least_cells: int = 20  #: with two neighbors; fewer may be a single cliff
     most_points: int = 200_000  #: a slope is as good from a sample
+    #: returns of one pulse are half a meter and more apart, so half of these points are higher
+    multiple_share: float = 0.05
+    flat_m: float = (
+        0.1  #: kilometers taken for meters bring 99 % of the points this close to ground
+    )
     elevation_m: float = 10_000.0  #: above it there is no land, and below -10,000 none either
 
 
 def doubt_vertical_unit(
-    height_m: NDArray, slope: float, vertical: float, elevation_m: float = 0.0
+    height_m: NDArray,
+    slope: float,
+    vertical: float,
+    elevation_m: float = 0.0,
+    too_flat: bool = False,
 ) -> str:
     """Return a warning if vegetation, ground or its slope is too high to be true, else "".
 
@@ -75,6 +84,8 @@ def doubt_vertical_unit(
         The unit of z that was assumed, in meters.
     elevation_m : float
         The points' median elevation, in meters.
+    too_flat : bool
+        What :func:`is_too_flat` returns.
 
     Returns
     -------
@@ -92,6 +103,11 @@ def doubt_vertical_unit(
         what = (
             f"half of the points are more than {limits.elevation_m:,.0f} m above or below the sea"
         )
+    elif too_flat:
+        what = (
+            f"nearly all points lie within {limits.flat_m:g} m of the ground, though many pulses "
+            "have several returns"
+        )
     else:
         return ""
     return (
@@ -100,6 +116,21 @@ def doubt_vertical_unit(
         "--readers.las.override_srs=EPSG:26910+6360 (US survey feet), or by 'vertical_unit' of "
         "each stage"
     )
+
+
+def is_too_flat(
+    height_m: NDArray, returns_of_pulse: NDArray, limits: UnitDoubts = UnitDoubts()
+) -> bool:
+    """Tell whether points lie too close to the ground for pulses with several returns.
+
+    `height_m` (n,) are heights above the ground in meters, `returns_of_pulse` (n,) how many returns
+    the pulse of each point has.
+    """
+    multiple = np.count_nonzero(returns_of_pulse > 1)
+    if len(height_m) < limits.least_points:
+        return False
+    many = multiple >= limits.multiple_share * len(height_m)
+    return bool(many and np.quantile(height_m, 0.99) < limits.flat_m)
 
 
 def median_slope(xyz_m: NDArray, height_m: NDArray, limits: UnitDoubts = UnitDoubts()) -> float:

@@ -29,7 +29,7 @@ from ..base.dimensions import (
 )
 from ..base.errors import OptionError
 from ..base.progress import Progress
-from ..base.units import doubt_vertical_unit, median_slope
+from ..base.units import doubt_vertical_unit, is_too_flat, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
@@ -255,10 +255,12 @@ class ApplyModel(Stage, settings=PredictionOptions):
         }
         dimensions |= {name: points.dimension(name) for name in self.model.required_dimensions}
         ground = self._may_be_ground(points) if self.given_ground else None
-        slope = elevation = 0.0
+        slope, elevation, too_flat = 0.0, 0.0, False
         if _HEIGHT in points.arrays and points.count:
             slope = median_slope(points.xyz, points.dimension(_HEIGHT))
             elevation = float(np.median(points.xyz[:, 2]))
+            if (returns := points.arrays.get("NumberOfReturns")) is not None:
+                too_flat = is_too_flat(points.dimension(_HEIGHT), returns)
         points.keep_only([*dimensions, *self.creates(), _HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             prediction = self.model.predict(
@@ -280,7 +282,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
         if _HEIGHT in points.arrays:
             leaves = wanted & np.isin(codes, (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION))
             leaf_heights = points.dimension(_HEIGHT)[leaves]
-            doubt = doubt_vertical_unit(leaf_heights, slope, points.units.vertical, elevation)
+            doubt = doubt_vertical_unit(
+                leaf_heights, slope, points.units.vertical, elevation, too_flat
+            )
             points.report.warnings += [doubt] if doubt else []
         values = self._columns(points, prediction)
         if self.mark:
