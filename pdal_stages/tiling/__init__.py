@@ -14,7 +14,13 @@ Words of this room:
   computed between two rounds; its grid is not that of the tiles. (In :mod:`.sorted_points` a
   ``BLOCK`` is so many points.)
 - **job**: a tile, square, block or output, or an input that is to be read, and its state.
-- **mark**: fingerprint of everything that affects a job's result; ``--resume`` keeps what has the
-  same one. The marks of points (``_MARKS`` of :mod:`.run_tile`) are dimensions that say where a
-  point comes from.
+- **digest** of a job: fingerprint of everything that affects its result; ``--resume`` keeps what
+  has the same one.
+- **origin** of a point (``_ORIGIN`` of :mod:`.run_tile`): the dimensions that say from which row of
+  which piece it comes, and how far outside the tile it lies.
+
+Each word has a type: ``TilePlan.head`` and ``tail`` and :class:`.plan.Round`, ``Round.halo_m``,
+:class:`.sorted_points.Piece`, :class:`.options.TileGrid` of tiles and squares,
+:class:`..stages.base.Blocks`, :class:`.jobs.Job`. A tile is made in five steps, read, join, run,
+and save or write: :func:`.run_tile.run_tile`.
 """

@@ -50,7 +50,7 @@ class Job:
     #: files of the writers; None for a tile whose points go into outputs of input files
     outputs: list[str] | None = None
     jobs: list[Job] = field(default_factory=list)  #: those that it needs: an output its tiles
-    mark: str = ""  #: fingerprint of everything that affects its result
+    digest: str = ""  #: fingerprint of everything that affects its result
     target: str = ""  #: of an input to be read: the path of its sorted copy
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier
     #: run) or ``failed``.
@@ -257,13 +257,13 @@ class Store:
         """Return the path of a file of arrays."""
         return str(self.kept / f"{name}{_ARRAYS}")
 
-    def finish(self, name: str, mark: str, record: Mapping[str, Any]) -> None:
+    def finish(self, name: str, digest: str, record: Mapping[str, Any]) -> None:
         """Save the record of a finished job.
 
-        `mark` is the fingerprint of everything that affects it.
+        `digest` is the fingerprint of everything that affects it.
         """
         partial = self.kept / f"{name}.partial"
-        partial.write_text(json.dumps({**record, "fingerprint": mark}))
+        partial.write_text(json.dumps({**record, "fingerprint": digest}))
         os.replace(partial, self._note(name))
 
     def forget(self, name: str) -> None:
@@ -278,12 +278,12 @@ class Store:
         except (OSError, ValueError, RecursionError):
             return {}
 
-    def finished(self, name: str, mark: str) -> dict[str, Any] | None:
-        """Return the record of a job if `mark` matches and the files it wrote are unchanged."""
+    def finished(self, name: str, digest: str) -> dict[str, Any] | None:
+        """Return the record of a job if `digest` matches and the files it wrote are unchanged."""
         record = self.note(name)
         with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
             files = record.get("outputs", [])
-            if record.get("fingerprint") == mark and all(map(_is_as_written, files)):
+            if record.get("fingerprint") == digest and all(map(_is_as_written, files)):
                 return record
         return None
 

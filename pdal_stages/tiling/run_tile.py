@@ -1,4 +1,10 @@
-"""Run a round on a tile: its points with a halo go through stages, and its results are saved.
+"""Run a round on a tile, step by step: read, join, run, then save or write (:func:`run_tile`).
+
+- **read** the points of a tile and its halo, of each input a piece;
+- **join** them with what earlier rounds saved (:mod:`.earlier_rounds`);
+- **run** the stages of the round on them;
+- look whether the halo sufficed: else read again, farther;
+- **save** the results of the tile's own points, or **write** the outputs.
 
 Filtered ground depends on points some 400 m around a tile, but only through a raster of the
 lowest points and of the positions of ground points in each cell. So squares of some tiles are read
@@ -6,27 +12,24 @@ first, with the halo of the earlier stages (noise is marked before heights are c
 points, possible ground points, and changes by earlier stages are saved. Then blocks of the raster
 are computed from the lowest points around them and the points inside. Finally a tile reads the
 points that the later stages need, applies the saved changes, and takes the raster from the blocks.
-
-What a stage saves and computes is its own affair: see :class:`..stages.base.FarReaching`.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
-from ..base.grid import places_among
 from ..base.las_copy import LasCopy
 from ..base.las_points import RecordColumns, SomeRows
 from ..pipeline.copies import selection
@@ -34,12 +37,20 @@ from ..pipeline.pdal_facts import check_outputs
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
-from ..stages.base import WHOLE_CLOUD, FarReaching, inside_block
+from ..stages.base import WHOLE_CLOUD
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, SELECTED, class_counts
 from ..stages.registry import stage_types
+from .earlier_rounds import (
+    ChangedValues,
+    far_reaching,
+    load_blocks,
+    load_changes,
+    ready_stages,
+    with_threads,
+)
 from .inputs import InputSource
-from .jobs import SavedArrays, load_arrays, save_arrays, written
-from .options import Box, TileGrid, inside
+from .jobs import save_arrays, written
+from .options import Box, inside
 from .plan import INPUT, OUTSIDE, ROW, RunContext
 from .sorted_points import Piece, cut_all
 from .write_outputs import PieceResults, arrays_of, write_tile
@@ -47,121 +58,11 @@ from .write_outputs import PieceResults, arrays_of, write_tile
 #: How many times a tile is read again with a wider halo (not tuned); one that needs more is
 #: reported as ``short``.
 _MOST_WIDENINGS = 3
-_MARKS = (ROW, INPUT, OUTSIDE)
+#: Dimensions that say where a point of a tile comes from.
+_ORIGIN = (ROW, INPUT, OUTSIDE)
 
 
-# ---- results of earlier rounds -------------------------------------------------------------------
-
-#: Dimension -> rows of a piece and their new values.
-ChangedValues = dict[str, tuple[NDArray[np.int64], NDArray]]
-
-#: Stages of the run that this process works for, by its temporary folder.
-_ready: dict[str, list[ExpandedStage | None]] = {}
-
-
-def ready_stages(context: RunContext) -> list[ExpandedStage | None]:
-    """Return our stages of the head, made once in a process; None in the places of PDAL's."""
-    if context.scratch not in _ready:
-        _ready.clear()
-        head = [with_threads(step, context.threads) for step in context.plan.head]
-        expanded = Pipeline(head).expanded.ours if head else []
-        ours = {stage.number: stage for stage in expanded}
-        _ready[context.scratch] = [ours.get(number) for number in range(len(head))]
-    return _ready[context.scratch]
-
-
-def with_threads(step: dict[str, Any], threads: int) -> dict[str, Any]:
-    """Return a stage that uses no more threads than its worker has."""
-    if step["type"] not in stage_types():
-        return dict(step)
-    wanted = int(step.get("threads") or 0)
-    return {**step, "threads": min(wanted, threads) if wanted else threads}
-
-
-def far_reaching(context: RunContext) -> FarReaching:
-    """Return the stage that blocks are computed for."""
-    at = next(part.end for part in context.plan.rounds if part.blocks)
-    stage = ready_stages(context)[at]
-    assert stage is not None
-    return cast(FarReaching, stage.stage)
-
-
-def square_name(context: RunContext, number: int, square: tuple[int, int]) -> str:
-    """Return the name of the result of a round for a square."""
-    return f"{context.squares.name(square)}.round{number}"
-
-
-def block_name(block: tuple[int, int]) -> str:
-    """Return the name of a block of the raster."""
-    return f"{block[0]}_{block[1]}.block"
-
-
-def make_block(
-    context: RunContext, block: tuple[int, int], squares: Sequence[str], target: str
-) -> dict[str, Any]:
-    """Save a block of the raster, computed from the files of squares around it; return a record."""
-    blocks = context.plan.blocks
-    assert blocks is not None
-    low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(block, blocks.reach)
-    parts = [np.empty((0, 3))]
-    for path in squares:
-        points = load_arrays(path, ["around"])["around"]
-        x, y = points[:, 0], points[:, 1]
-        parts.append(points[(x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)])
-    files = (load_arrays(path, [inside_block(block)]) for path in squares)
-    inside = (points for arrays in files for points in arrays.values())
-    save_arrays(target, far_reaching(context).compute_block(np.concatenate(parts), inside, block))
-    return {"outputs": written([target])}
-
-
-def blocks_near(context: RunContext, box: Box, distance_m: float) -> list[tuple[int, int]]:
-    """Return the blocks that touch a box, in the unit of the coordinates, grown by some meters."""
-    assert context.plan.blocks is not None
-    x0, y0, x1, y1 = (side * context.unit for side in box)
-    grown = (x0 - distance_m, y0 - distance_m, x1 + distance_m, y1 + distance_m)
-    return TileGrid(context.plan.blocks.side).covering(grown)
-
-
-def load_blocks(context: RunContext, box: Box, read_m: float) -> list[SavedArrays]:
-    """Return the blocks for a tile (its box) that is read with some meters around it."""
-    assert context.plan.blocks is not None
-    distance_m = read_m + context.plan.blocks.margin + context.plan.blocks.spill
-    names = map(block_name, blocks_near(context, box, distance_m))
-    return [SavedArrays(path) for path in _existing(context.kept, names)]
-
-
-def load_changes(
-    context: RunContext, number: int, box: Box, pieces: list[Piece]
-) -> list[ChangedValues]:
-    """Return the new values that a round gave to the points of each piece in a box."""
-    squares = (square_name(context, number, each) for each in context.squares.covering(box))
-    rows_of: list[list[NDArray]] = [[] for _ in pieces]
-    values_of: list[dict[str, list[NDArray]]] = [{} for _ in pieces]
-    for path in _existing(context.kept, squares):
-        saved = load_arrays(path, {piece.source.key for piece in pieces})
-        for piece, all_rows, columns in zip(pieces, rows_of, values_of, strict=True):
-            points = saved.get(piece.source.key)
-            if points is not None:
-                rows, present = places_among(piece.index, points["index"])
-                all_rows.append(rows[present])
-                for name in list(points.dtype.names or ())[1:]:
-                    columns.setdefault(name.removeprefix("dim/"), []).append(points[name][present])
-    return [
-        {name: (np.concatenate(rows), np.concatenate(c)) for name, c in columns.items()}
-        for rows, columns in zip(rows_of, values_of, strict=True)
-    ]
-
-
-def _existing(folder: str, names: Iterable[str]) -> list[str]:
-    """Return the paths of the files that exist; others would have no points."""
-    paths = (os.path.join(folder, f"{name}.npz") for name in names)
-    return [path for path in paths if os.path.exists(path)]
-
-
-# ---- one run -------------------------------------------------------------------------------------
-
-
-class HeadResult(NamedTuple):
+class RoundResult(NamedTuple):
     """Results of a round for a tile."""
 
     results: list[PieceResults]
@@ -172,7 +73,7 @@ class HeadResult(NamedTuple):
 
 
 @dataclass
-class _HeadRun:
+class _RoundRun:
     """One run of a round on a tile and what was read around it."""
 
     context: RunContext
@@ -191,15 +92,15 @@ class _HeadRun:
     steps: dict[int, int] = field(default_factory=dict)
     expanded: dict[int, ExpandedStage] = field(default_factory=dict)  #: by place in the pipeline
 
-    def run(self) -> HeadResult:
+    def run(self) -> RoundResult:
         """Run the steps of the round."""
         plan = self.context.plan
         part = plan.rounds[self.number]
-        marks = self._marks()
-        pipeline = self._pipeline(marks)
+        origins = self._origins()
+        pipeline = self._pipeline(origins)
         if plan.read_here:
             parts = [(piece.layout, piece.records) for piece in self.pieces]
-            known = _concatenate_by_name(marks)
+            known = _concatenate_by_name(origins)
             seen = pipeline.run_here(RecordColumns(parts), self.context.wkt, known, self._after)
             self._take({"spatialreference": {"wkt": self.context.wkt}}, seen, {})
         else:
@@ -210,9 +111,9 @@ class _HeadRun:
                 distance_m = part.used_m[step] + part.upstream_m[step]
                 self.needs_m += [distance_m + r.reach for r in stage.reports if r.beyond_halo]
         messages = _messages(pipeline, self.context.scratch)
-        if plan.where and len(marks) and not any(mark[SELECTED].any() for mark in marks):
+        if plan.where and len(origins) and not any(each[SELECTED].any() for each in origins):
             messages.append(f"{NO_POINT_MATCHES} {plan.where}")
-        return HeadResult(
+        return RoundResult(
             _collect(self.views, self.pieces),
             max(self.needs_m),
             messages,
@@ -220,7 +121,7 @@ class _HeadRun:
             self.reduced,
         )
 
-    def _marks(self) -> list[dict[str, NDArray]]:
+    def _origins(self) -> list[dict[str, NDArray]]:
         """Return dimensions that number a piece's points, with what an earlier round changed."""
         plan, context = self.context.plan, self.context
         changed = [ChangedValues()] * len(self.pieces)
@@ -228,15 +129,15 @@ class _HeadRun:
             box = self._box(self.halo_m / context.unit)
             changed = load_changes(context, self.number - 1, box, self.pieces)
         return [
-            _marked(number, piece, context, changed[number])
+            _with_origin(number, piece, context, changed[number])
             for number, piece in enumerate(self.pieces)
         ]
 
-    def _pipeline(self, marks: Sequence[Mapping[str, NDArray]]) -> Pipeline:
+    def _pipeline(self, origins: Sequence[Mapping[str, NDArray]]) -> Pipeline:
         """Return the pipeline of the round, its stages with their contexts."""
         plan, ready = self.context.plan, ready_stages(self.context)
         part = plan.rounds[self.number]
-        stages = self._stages_here() if plan.read_here else self._stages(marks)
+        stages = self._stages_here() if plan.read_here else self._stages(origins)
         ours = [stage for stage in ready[part.begin : part.end] if stage is not None]
         pipeline = Pipeline(stages, ready=ours)
         self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
@@ -268,20 +169,20 @@ class _HeadRun:
             stages.append(with_threads(self.context.plan.head[number], self.context.threads))
         return stages
 
-    def _stages(self, marks: Sequence[Mapping[str, NDArray]]) -> list[dict[str, Any]]:
+    def _stages(self, origins: Sequence[Mapping[str, NDArray]]) -> list[dict[str, Any]]:
         """Return the pipeline of a round with PDAL's filters.
 
-        It reads pieces that are written for it, with their marks as extra bytes, runs the steps,
+        It reads pieces that are written for it, with their origin as extra bytes, runs the steps,
         and calls functions that take their results.
         """
         plan, context = self.context.plan, self.context
         stages = []
-        for number, (piece, mark) in enumerate(zip(self.pieces, marks, strict=True)):
+        for number, (piece, origin) in enumerate(zip(self.pieces, origins, strict=True)):
             path = os.path.join(self.folder, f"piece{number}.las")
-            added = {n: v.dtype for n, v in mark.items() if n not in piece.layout.names}
+            added = {n: v.dtype for n, v in origin.items() if n not in piece.layout.names}
             copy = LasCopy(piece.source.path, piece.layout, False, added)
             with copy.writing_to(Path(path)):
-                copy.write(piece.records, mark)
+                copy.write(piece.records, origin)
             reader = {**piece.reader, "filename": path, "tag": f"in{number}"}
             stages.append({**reader, "use_eb_vlr": True})
         tags = [stage["tag"] for stage in stages]
@@ -325,8 +226,8 @@ class _HeadRun:
         wanted = self.context.plan.creates if self._is_last else part.kept
         names = [name for name in (ins if wanted is None else wanted) if name in ins]
         rows = np.flatnonzero(ins[OUTSIDE] < 0)
-        marks = [ROW, INPUT, *(name for name in names if name not in _MARKS)]
-        self.views.append({name: ins[name][rows] for name in marks})
+        origins = [ROW, INPUT, *(name for name in names if name not in _ORIGIN)]
+        self.views.append({name: ins[name][rows] for name in origins})
         if part.blocks is not None and len(rows):
             stage = far_reaching(self.context)
             points = points_of(stage, WHOLE_CLOUD, module, SomeRows(ins, rows))
@@ -358,13 +259,13 @@ def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
     return lines
 
 
-def _marked(
+def _with_origin(
     number: int, piece: Piece, context: RunContext, changed: ChangedValues
 ) -> dict[str, NDArray]:
-    """Return dimensions that mark a piece's points, with those that an earlier round changed."""
+    """Return where a piece's points come from, and the dimensions that an earlier round changed."""
     count, layout = len(piece.index), piece.layout
     columns = RecordColumns([(layout, piece.records)])
-    marks: dict[str, NDArray] = {
+    origins: dict[str, NDArray] = {
         ROW: np.arange(count, dtype=np.uint32),
         INPUT: np.full(count, number, np.uint32),
         OUTSIDE: np.where(piece.away < 0, -1.0, piece.away * context.unit),
@@ -374,13 +275,13 @@ def _marked(
         kind = values.dtype
         out = columns[name].astype(kind) if name in columns else np.zeros(count, kind)
         out[rows] = values
-        marks[name] = out
-    return marks
+        origins[name] = out
+    return origins
 
 
 def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[PieceResults]:
     """Return results of the tile's own points, in the order of their pieces."""
-    names = [name for view in views[:1] for name in view if name not in _MARKS]
+    names = [name for view in views[:1] for name in view if name not in _ORIGIN]
     results = []
     for number, piece in enumerate(pieces):
         parts = [(view, np.flatnonzero(view[INPUT] == number)) for view in views]
@@ -399,6 +300,58 @@ def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[Piece
             values["Classification"] = values["Classification"] & np.uint8(LEGACY_LIMIT)
         results.append(PieceResults(piece, rows, values))
     return results
+
+
+@dataclass
+class _TileHalo:
+    """How far around a tile points are read, and whether that suffices."""
+
+    context: RunContext
+    number: int  #: of the round
+    tile: tuple[int, int]
+    complete_m: float  #: within which all inputs are known
+    used_m: float
+    short: bool = False  #: more is needed, and too much to read
+    attempts: int = 0
+
+    @property
+    def complete(self) -> bool:
+        """Return whether all points of the inputs are read, so that none lies farther away."""
+        grid = self.context.grid_of(self.number)
+        return inside(self.context.bounds, grid.box(self.tile, self.used_m / self.context.unit))
+
+    @property
+    def side_m(self) -> float:
+        """Return the side of the tile in meters."""
+        return self.context.grid_of(self.number).size * self.context.unit
+
+    def widen(self, needed_m: float, read: int) -> bool:
+        """Widen it to what stages need, `read` points so far; False where it stays as it is."""
+        if self.complete or needed_m <= self.used_m:
+            return False
+        if math.isinf(needed_m):  # there are too few points
+            needed_m = self.used_m + 2 * self.side_m
+        wider = (self.side_m + 2 * needed_m) / (self.side_m + 2 * self.used_m)
+        too_many = read * wider**2 > self.context.most_points
+        self.short = too_many or needed_m > self.complete_m or self.attempts == _MOST_WIDENINGS
+        if not self.short:
+            self.used_m, self.attempts = needed_m + 1e-6, self.attempts + 1
+        return not self.short
+
+
+@dataclass
+class TileRecord:
+    """What is known of a tile that ran."""
+
+    points: int  #: of the tile
+    read: int  #: with its halo
+    halo_m: float  #: that was used
+    short: bool  #: whether that was too narrow
+    widened: bool  #: whether it is wider than planned
+    dropped: int  #: points that stages removed
+    classes: dict[str, int]  #: points by class code
+    messages: Sequence[str]
+    point_counts: Mapping[str, int]  #: by ``type.name``
 
 
 # ---- the task of a worker ------------------------------------------------------------------------
@@ -433,77 +386,81 @@ def run_tile(
     Returns
     -------
     dict
-        The record of the job.
+        The :class:`TileRecord`, and what was written.
     """
+    halo = _TileHalo(context, number, tile, complete_m, context.plan.rounds[number].halo_m)
     with TemporaryDirectory(dir=context.scratch, ignore_cleanup_errors=True) as folder:
-        head, record = _run_with_halo(context, number, tile, sources, complete_m, folder)
-        if outputs is not None:
-            output = write_tile(head.results, context.plan, outputs, context.scratch)
-            messages = [*record["messages"], *output.get("messages", [])]
-            return record | output | {"messages": messages}
-        part, arrays = context.plan.rounds[number], arrays_of(head.results)
-        if number + 1 < len(context.plan.rounds):
-            arrays = arrays if part.kept else {}
-        if part.blocks is not None:
-            arrays |= _concatenate_by_name([{"around": np.empty((0, 3))}, *head.reduced])
-        save_arrays(target, arrays)
-        return record | {"outputs": written([target])}
+        while True:
+            pieces = _read(halo, sources)
+            result = _join_and_run(halo, pieces, folder)
+            needed_m = _wider(halo) if result is None else result.halo_needed_m
+            if not halo.widen(needed_m, sum(len(piece.index) for piece in pieces)):
+                break
+        if result is None:
+            what = "no terrain: no point near the tile can be part of it"
+            raise NoTerrainError(what, found=f"within {halo.used_m:.0f} m")
+        record = vars(_describe(halo, pieces, result))
+        if outputs is None:
+            return record | _save(halo, result, target)
+        output = write_tile(result.results, context.plan, outputs, context.scratch)
+        messages = [*record["messages"], *output.get("messages", [])]
+        return record | output | {"messages": messages}
 
 
-def _run_with_halo(
-    context: RunContext,
-    number: int,
-    tile: tuple[int, int],
-    sources: Sequence[InputSource],
-    complete_m: float,
-    folder: str,
-) -> tuple[HeadResult, dict[str, Any]]:
-    """Run a round with a sufficient halo; return results and a record.
+def _read(halo: _TileHalo, sources: Sequence[InputSource]) -> list[Piece]:
+    """Return the points of a tile and its halo, from each input that has any there."""
+    context = halo.context
+    grid = context.grid_of(halo.number)
+    return cut_all(grid, halo.tile, sources, halo.used_m / context.unit)
 
-    It has the ``points`` of the tile, those ``read`` with its halo, the ``halo_m`` used, and
-    whether that was too ``short``.
-    """
-    grid, part = context.grid_of(number), context.plan.rounds[number]
-    side_m, halo_m, short = grid.size * context.unit, part.halo_m, False
-    head: HeadResult | None = None
-    for attempt in range(_MOST_WIDENINGS + 1):
-        pieces = cut_all(grid, tile, sources, halo_m / context.unit)
-        read = sum(len(piece.index) for piece in pieces)
-        points = sum(len(piece.own_rows) for piece in pieces)
-        if not points or (not context.plan.head and part.blocks is None):
-            head = HeadResult([PieceResults(piece, piece.own_rows, {}) for piece in pieces])
-            break
-        complete = inside(context.bounds, grid.box(tile, halo_m / context.unit))
-        try:
-            head = _HeadRun(context, number, tile, pieces, halo_m, complete, folder).run()
-            needed_m = head.halo_needed_m
-        except NoTerrainError:
-            if complete:
-                raise
-            head, needed_m = None, side_m + 2 * part.halo_m  # look farther away
-        if complete or needed_m <= halo_m:
-            break
-        short = True
-        if math.isinf(needed_m):  # there are too few points
-            needed_m = halo_m + 2 * side_m
-        estimate = read * ((side_m + 2 * needed_m) / (side_m + 2 * halo_m)) ** 2
-        if attempt == _MOST_WIDENINGS or estimate > context.most_points or needed_m > complete_m:
-            break
-        halo_m, short = needed_m + 1e-6, False
-    if head is None:
-        raise NoTerrainError(
-            "no terrain: no point near the tile can be part of it", found=f"within {halo_m:.0f} m"
-        )
+
+def _join_and_run(halo: _TileHalo, pieces: list[Piece], folder: str) -> RoundResult | None:
+    """Join pieces with results of earlier rounds, run the stages; None where no ground is near."""
+    plan, part = halo.context.plan, halo.context.plan.rounds[halo.number]
+    has_points = any(len(piece.own_rows) for piece in pieces)
+    if not has_points or (not plan.head and part.blocks is None):
+        return RoundResult([PieceResults(piece, piece.own_rows, {}) for piece in pieces])
+    complete = halo.complete
+    try:
+        return _RoundRun(
+            halo.context, halo.number, halo.tile, pieces, halo.used_m, complete, folder
+        ).run()
+    except NoTerrainError:
+        if complete:
+            raise
+        return None
+
+
+def _wider(halo: _TileHalo) -> float:
+    """Return the halo in meters in which ground is looked for after none was near."""
+    return halo.side_m + 2 * halo.context.plan.rounds[halo.number].halo_m
+
+
+def _describe(halo: _TileHalo, pieces: list[Piece], result: RoundResult) -> TileRecord:
+    """Return the record of a tile."""
+    points = sum(len(piece.own_rows) for piece in pieces)
     classes = [np.zeros(0, np.uint8)]
-    classes += [r.values["Classification"] for r in head.results if "Classification" in r.values]
-    return head, {
-        "points": points,
-        "read": read,
-        "halo_m": halo_m,
-        "short": short,
-        "widened": halo_m > part.halo_m,
-        "dropped": points - sum(len(result.rows) for result in head.results),
-        "classes": class_counts(np.concatenate(classes)),
-        "messages": head.messages,
-        "point_counts": head.point_counts,
-    }
+    classes += [r.values["Classification"] for r in result.results if "Classification" in r.values]
+    return TileRecord(
+        points,
+        sum(len(piece.index) for piece in pieces),
+        halo.used_m,
+        halo.short,
+        halo.used_m > halo.context.plan.rounds[halo.number].halo_m,
+        points - sum(len(each.rows) for each in result.results),
+        class_counts(np.concatenate(classes)),
+        result.messages,
+        result.point_counts,
+    )
+
+
+def _save(halo: _TileHalo, result: RoundResult, target: str) -> dict[str, Any]:
+    """Save what the next round, or an output, needs; return the file in a record."""
+    plan = halo.context.plan
+    part, arrays = plan.rounds[halo.number], arrays_of(result.results)
+    if halo.number + 1 < len(plan.rounds) and not part.kept:
+        arrays = {}
+    if part.blocks is not None:
+        arrays |= _concatenate_by_name([{"around": np.empty((0, 3))}, *result.reduced])
+    save_arrays(target, arrays)
+    return {"outputs": written([target])}

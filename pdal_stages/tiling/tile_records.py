@@ -102,7 +102,7 @@ class RecordRun(SurveyRun):
                 of_tile[i + k, j + l] for l in wide for k in wide if (i + k, j + l) in of_tile
             ]
             near |= {(i, j): around} if around else {}
-        marks = {tile: [job.mark for job in around] for tile, around in near.items()}
+        marks = {tile: [job.digest for job in around] for tile, around in near.items()}
         points = {tile: of_tile[tile].points if tile in of_tile else 1 for tile in near}
         jobs = self._jobs(name, points, marks)
 
@@ -125,7 +125,7 @@ class RecordRun(SurveyRun):
         """Return jobs for tiles with their numbers of points, and with what affects each."""
         grid, common = self.survey.grid, [build(), name, vars(self.survey.grid)]
         return [
-            Job(f"{grid.name(tile)}.{name}", n, tile, mark=fingerprint(common, tile, marks[tile]))
+            Job(f"{grid.name(tile)}.{name}", n, tile, digest=fingerprint(common, tile, marks[tile]))
             for tile, n in points.items()
         ]
 

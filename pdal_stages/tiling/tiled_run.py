@@ -26,11 +26,12 @@ from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import NO_REFERENCE
 from ..pipeline.workers import ThisProcess, WorkerProcesses, run_tasks
 from ..stages.points import METERS_ASSUMED
+from .earlier_rounds import block_name, blocks_near, make_block, square_name
 from .inputs import CloudIndex, Survey
 from .jobs import InterruptedRun, Job, Store, TiledRun, messages_of, summarize
 from .options import Box, TileGrid, TilingOptions, worker_bytes
 from .plan import RunContext, TilePlan, make_plan, outputs_for
-from .run_tile import block_name, blocks_near, make_block, run_tile, square_name
+from .run_tile import run_tile
 from .sorted_points import TEMPORARY, sort_points
 from .write_outputs import write_file
 
@@ -208,7 +209,7 @@ class SurveyRun:
                 else:
                     job.state, job.record = "done", answer.result | answer.cost
                     with contextlib.suppress(OSError):  # no room: a later run does it again
-                        self.store.finish(job.name, job.mark, job.record)
+                        self.store.finish(job.name, job.digest, job.record)
                 if not job.is_output:
                     done += not answer.reason
                     failures += [answer.reason] if answer.reason else []
@@ -266,7 +267,7 @@ class SurveyRun:
         """Return the waiting jobs that no earlier run has finished."""
         waiting = deque(job for job in jobs if job.state == "waiting")
         for job in waiting:
-            if known := self.store.finished(job.name, job.mark):
+            if known := self.store.finished(job.name, job.digest):
                 job.state, job.record = "kept", known
             elif not self.survey.options.overwrite and (paths := self.store.edited(job.name)):
                 job.state, job.record = "kept", self.store.note(job.name)
@@ -321,7 +322,7 @@ class _Run(SurveyRun):
     def find_jobs(self) -> None:
         """Find all tiles and outputs; those with unreadable inputs fail.
 
-        A job's mark is a fingerprint of everything that affects its result, including every input
+        A job's digest is a fingerprint of everything that affects its result, including every input
         that may be read for it.
         """
         plan, survey, grid = self.plan, self.survey, self.survey.grid
@@ -337,7 +338,7 @@ class _Run(SurveyRun):
         for tile, points in survey.tiles().items():
             job = Job(grid.name(tile), points, tile)
             near = survey.near(tile, max(sees, self.farthest))
-            job.mark = fingerprint(common, tile, [source.content for source in near])
+            job.digest = fingerprint(common, tile, [source.content for source in near])
             if bad := [source.path for source in survey.near(tile, sees) if source.fault]:
                 job.fail(f"an input here cannot be read: {bad[0]}", blocked=True)
             self.tiles.append(job)
@@ -352,7 +353,7 @@ class _Run(SurveyRun):
             out = Job(f"file-{source.key}", source=source, outputs=paths)
             if index := source.index:
                 out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
-            out.mark = fingerprint(source.content, tail, [job.mark for job in out.jobs], paths)
+            out.digest = fingerprint(source.content, tail, [job.digest for job in out.jobs], paths)
             if source.fault:
                 out.fail(f"its input cannot be read: {source.path}", blocked=True)
             self.outputs.append(out)
@@ -377,7 +378,7 @@ class _Run(SurveyRun):
                 known = self.store.note(job.name)
                 job.state, job.record = (
                     "kept",
-                    known if known.get("fingerprint") == job.mark else {},
+                    known if known.get("fingerprint") == job.digest else {},
                 )
 
     @cached_property
@@ -387,10 +388,18 @@ class _Run(SurveyRun):
         if survey.density.points <= most:
             most = 1 << 62  # all points fit, however wide the halo
         plan = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
-        grids, store = (survey.grid, survey.squares), self.store
-        folders = str(store.scratch), str(store.kept)
-        wkt, threads = survey.reference.wkt, self.workers.threads
-        return RunContext(plan, *grids, survey.unit, survey.bounds, threads, most, wkt, *folders)
+        return RunContext(
+            plan,
+            grid=survey.grid,
+            squares=survey.squares,
+            unit=survey.unit,
+            bounds=survey.bounds,
+            threads=self.workers.threads,
+            most_points=most,
+            wkt=survey.reference.wkt,
+            scratch=str(self.store.scratch),
+            kept=str(self.store.kept),
+        )
 
     def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
         """Run all waiting tiles, and outputs as soon as their last tile is done.
@@ -516,24 +525,24 @@ class _Run(SurveyRun):
                     box_m = TileGrid(part.blocks.side).box(place, part.blocks.reach + 1.0)
                     x0, y0, x1, y1 = (side / unit for side in box_m)
                     needed = squares_in((x0, y0, x1, y1))
-                    mark = fingerprint(place, part.blocks, [each.mark for each in needed])
-                    blocks[place] = Job(block_name(place), 1, place, jobs=needed, mark=mark)
+                    digest = fingerprint(place, part.blocks, [each.digest for each in needed])
+                    blocks[place] = Job(block_name(place), 1, place, jobs=needed, digest=digest)
                 job.jobs.append(blocks[place])
         return list(squares.values()), list(blocks.values())
 
     def _square_job(self, number: int, square: tuple[int, int]) -> Job:
-        """Return the job of a square; its mark tells of all inputs that may matter."""
+        """Return the job of a square; its digest tells of all inputs that may matter."""
         survey, part = self.survey, self.plan.rounds[number]
         head = self.plan.head[: part.end + (part.blocks is not None)]
         far = max(self.plan.sees_m / survey.unit if number else 0.0, self.farthest)
         box = survey.squares.box(square, far)
-        mark = fingerprint(
+        digest = fingerprint(
             [build(), head, survey.stamps_of(self.plan.files[: len(head)])],
             [survey.layout, survey.unit, vars(part), square],
             [source.content for source in survey.near_box(box) if not source.fault],
         )
         name = square_name(self._context, number, square)
-        return Job(name, self._points_of_squares[square], square, mark=mark)
+        return Job(name, self._points_of_squares[square], square, digest=digest)
 
     def _block_task(self, job: Job) -> Callable[[], Any]:
         """Return the task that computes a block."""
