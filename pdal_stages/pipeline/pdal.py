@@ -13,29 +13,24 @@ import logging
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from types import CodeType, FrameType
-from typing import Any, TypeVar
+from typing import Any
 
 from ..base.errors import DependencyError, PipelineError
 from ..base.las import named_copc, named_las, source_id
-from ..base.las_check import CURE_OF_DAMAGE, check_readable
+from ..base.las_check import check_readable
 from .inputs_outputs import readers_files
+from .interrupts import runs_pdal
+from .pdal_errors import translate
 
 INSTALL = (
     "Install PDAL with its Python bindings and its program 'pdal' on PATH: conda install -c "
     "conda-forge python-pdal pdal-plugins; on Debian or Ubuntu see docs/install.md"
-)
-_DRIVER_CURE = (
-    "filters.python comes with the package pdal-plugins. Install it for this Python (pip install "
-    "pdal-plugins), and set PDAL_DRIVER_PATH to the folder that holds "
-    "libpdal_plugin_filter_python"
 )
 
 
@@ -178,10 +173,10 @@ def execute(
 #: in two threads is the other's log. It also holds Python still, so runs in threads gain nothing
 #: from each other.
 _one_run = threading.RLock()
-_CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure (?!\(\d+\) PROJ:).*)")
 
 
+@runs_pdal
 def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
@@ -245,110 +240,6 @@ def validate(stages: list[dict[str, Any]]) -> None:
         verdict = json.loads(done.stdout)
     if not verdict.get("valid", False):
         raise translate(str(verdict.get("error_detail") or "the pipeline is not valid"))
-
-
-FLAGS_IN_CLASSES = (
-    "this PDAL reads the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 as parts of the "
-    "class, and would make other classes of them here"
-)
-FLAGS_CURE = (
-    "Convert it first: laspy.convert(laspy.read(IN), point_format_id=6).write(OUT), 7 with colors; "
-    "or keep it LAS 1.2 and apart from those of LAS 1.4; or use PDAL 2.6. pdal-stages classify "
-    "needs none of this where it writes no other format"
-)
-BROKEN_REFERENCE = "the spatial reference in the file cannot be read"
-REFERENCE_CURE = (
-    "Name the right one, --readers.las.override_srs=EPSG:CODE "
-    '(in a pipeline "override_srs" of the reader)'
-)
-
-
-def translate(message: str, before: Sequence[str] = ()) -> PipelineError | DependencyError:
-    """Return PDAL's error text as one of our errors, with a cure where the cause is known.
-
-    `before` are the last lines of the log.
-    """
-    text = message.strip()
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    # PDAL quotes names of files, which may hold line breaks.
-    one_line = "; ".join([*lines, *before])
-    if re.search(r"(create|load|find).*filters\.python", text) or (
-        "filters.python" in text and "driver" in text.lower()
-    ):
-        return DependencyError("PDAL has no filters.python", found=one_line, cure=_DRIVER_CURE)
-    if "ModuleNotFoundError" in text and "pdal_stages" in text:
-        cure = "Install it into the Python that the plugin of filters.python was built for"
-        what = "the Python that PDAL runs does not have pdal_stages"
-        return DependencyError(what, found=lines[-1], cure=cure)
-    if _CUT_POINTS.search(text):
-        what = "the LAS file is damaged: its points cannot be decoded"
-        return PipelineError(what, found=one_line, cure=CURE_OF_DAMAGE)
-    if "convert spatial reference" in text:
-        return PipelineError(BROKEN_REFERENCE, found=one_line, cure=REFERENCE_CURE)
-    if "dimension with invalid name" in text:
-        cure = "Run it with pdal-stages classify, which takes names as they are"
-        return PipelineError("PDAL refuses the name of a dimension", found=one_line, cure=cure)
-    if "Traceback (most recent call last)" in text:  # of a script; a list in older PDAL
-        lines = [line.strip(" '") for line in text.replace("\\n", "\n").splitlines()]
-        place = [line for line in lines if line.startswith("File ")][-1:]
-        last = [line for line in lines if line][-1]
-        return PipelineError("a script of filters.python failed", found="; ".join([last, *place]))
-    return PipelineError("PDAL could not run the pipeline", found=one_line)
-
-
-# ---- Ctrl-C while PDAL runs ----------------------------------------------------------------------
-
-# PDAL's plugins crash when KeyboardInterrupt comes up in Python code that PDAL called. So it is
-# raised only inside functions that are marked as interruptible, which hand it on as an error;
-# otherwise it waits for `check_interrupt`.
-_Function = TypeVar("_Function", bound=Callable)
-_interruptible: set[CodeType] = set()
-_handling = False
-_interrupted = False
-
-
-def interruptible(function: _Function) -> _Function:
-    """Mark a function inside which KeyboardInterrupt may be raised, even if PDAL called it."""
-    _interruptible.add(function.__code__)
-    return function
-
-
-def check_interrupt() -> None:
-    """Raise KeyboardInterrupt if the user pressed Ctrl-C."""
-    if _interrupted:
-        raise KeyboardInterrupt
-
-
-def _handle(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, unless PDAL runs and no interruptible function does."""
-    global _interrupted
-    _interrupted = True
-    inside_pdal = False
-    while frame is not None:
-        if frame.f_code in _interruptible:
-            raise KeyboardInterrupt
-        inside_pdal |= frame.f_code is _execute.__code__
-        frame = frame.f_back
-    if not inside_pdal:
-        raise KeyboardInterrupt
-
-
-@contextlib.contextmanager
-def deferred_interrupts() -> Iterator[None]:
-    """Handle Ctrl-C this way, and SIGTERM where Python handles it."""
-    global _interrupted, _handling
-    if _handling or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if callable(signal.getsignal(n))]
-    before = {number: signal.signal(number, _handle) for number in numbers}
-    _handling, _interrupted = True, False
-    try:
-        yield
-    finally:
-        _handling = _interrupted = False
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 # ---- what differs between versions ---------------------------------------------------------------

@@ -35,6 +35,7 @@ from ..base.units import Units
 from ..stages.registry import stage_types
 from . import pdal as pdal_env
 from .inputs_outputs import is_writer, readers_files, writes_las
+from .pdal_errors import FLAGS_CURE, FLAGS_IN_CLASSES
 from .runtime import ExpandedStage
 from .spatial_reference import MOVING, projection_records, reference_of
 
@@ -312,7 +313,7 @@ def check_flags(stages: Sequence[Mapping[str, Any]]) -> None:
         layout = Layout.of(path)
         for part in read_records(path, layout, only=["Classification"]):
             if (part["class"] > LEGACY_LIMIT).any():
-                what, cure = pdal_env.FLAGS_IN_CLASSES, pdal_env.FLAGS_CURE
+                what, cure = FLAGS_IN_CLASSES, FLAGS_CURE
                 raise PipelineError(what, where=path, cure=cure)
 
 

@@ -34,6 +34,7 @@ from .inputs_outputs import (
     writers_outputs,
     writes_las,
 )
+from .interrupts import check_interrupt, deferred_interrupts
 from .json_source import Override, PipelineSource, apply_overrides, read_pipeline
 from .spatial_reference import check_readers
 
@@ -357,9 +358,9 @@ def execute_whole(
 
     with whole_files(*outputs, check=finish) as partials:
         run = with_outputs(stages, list(partials))
-        with pdal_env.deferred_interrupts():
+        with deferred_interrupts():
             result = pdal_env.execute(run, **options)
-            pdal_env.check_interrupt()
+            check_interrupt()
         check()
     return result, {str(path): final for path, final in zip(partials, outputs, strict=True)}
 

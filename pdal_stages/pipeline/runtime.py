@@ -32,6 +32,8 @@ from ..stages.preprocessing import NEEDS_GROUND
 from ..stages.registry import place, stage_from
 from ..stages.where_expression import Expression
 from . import pdal as pdal_env
+from .interrupts import check_interrupt, interruptible
+from .pdal_errors import FLAGS_CURE, FLAGS_IN_CLASSES
 
 
 @dataclass(eq=False)
@@ -141,7 +143,7 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
     return True
 
 
-@pdal_env.interruptible
+@interruptible
 def _run_interruptible(
     arguments: Mapping[str, Any],
     module: dict[str, Any],
@@ -149,7 +151,7 @@ def _run_interruptible(
     outs: dict[str, Any],
 ) -> None:
     """Run a stage or a function on one view; any exception may come out, Ctrl-C too."""
-    pdal_env.check_interrupt()
+    check_interrupt()
     held = BY_LABEL.get(str(arguments.get("label", "")))
     (held or _from_arguments(arguments)).function(module, ins, outs)
 
@@ -234,7 +236,7 @@ def _refuse_mixed_flags(points: Points, formats: Sequence[int]) -> None:
     largest = int(points.arrays["Classification"].max(initial=0))
     if largest > LEGACY_LIMIT:
         found = f"PDAL {pdal_env.dotted_version()}, Classification {largest}"
-        raise StageError(pdal_env.FLAGS_IN_CLASSES, found=found, cure=pdal_env.FLAGS_CURE)
+        raise StageError(FLAGS_IN_CLASSES, found=found, cure=FLAGS_CURE)
 
 
 def run_on_nothing(stage: Stage) -> Report:

@@ -33,6 +33,7 @@ from ..base.units import (
 )
 from . import pdal as pdal_env
 from .inputs_outputs import LAS_READERS, readers_files
+from .pdal_errors import BROKEN_REFERENCE, REFERENCE_CURE
 from .runtime import reader_metadata, wkt_of
 
 #: Stages that may bring points into one reference.
@@ -116,7 +117,7 @@ def _wkt_of_keys(*records: tuple[int, bytes]) -> str:
 
 
 def _broken(reason: str) -> PipelineError:
-    return PipelineError(pdal_env.BROKEN_REFERENCE, found=reason, cure=pdal_env.REFERENCE_CURE)
+    return PipelineError(BROKEN_REFERENCE, found=reason, cure=REFERENCE_CURE)
 
 
 #: Numbers of the records of GeoTIFF keys: the directory, its numbers, its texts.

@@ -21,7 +21,7 @@ from ..base.files import NO_ROOM
 from ..base.processes import ProcessEnded, PythonProcess
 from ..base.progress import Progress
 from ..base.threads import CORES_VARIABLE, available_threads
-from .pdal import check_interrupt, deferred_interrupts
+from .interrupts import check_interrupt, deferred_interrupts
 
 #: The reason where a worker died.
 KILLED = str(ProcessEnded())

@@ -19,6 +19,7 @@ from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
 from ..pipeline import pdal as pdal_env
 from ..pipeline import runtime
+from ..pipeline.pdal_errors import translate
 from . import install
 
 #: Extra -> the package that it installs, and its purpose.
@@ -102,7 +103,7 @@ def _run_program(stages: list) -> None:
         try:
             pdal_env.ask_program("pipeline", str(path))
         except PipelineError as error:
-            raise pdal_env.translate(str(error.found)) from None
+            raise translate(str(error.found)) from None
 
 
 def _python_of(what: str, run: Callable[[list], object]) -> Finding:
