@@ -1,15 +1,10 @@
-"""Memory of the machine: sizes as users write them, what is free, and giving pages back."""
+"""Memory of the machine: sizes as users write them, and what is free."""
 
 from __future__ import annotations
 
-import ctypes
-import mmap
 import os
 import re
-import sys
 from pathlib import Path
-
-import numpy as np
 
 from .errors import OptionError
 
@@ -48,22 +43,6 @@ def parse_size(text: str) -> int:
 def free_memory() -> int:
     """Return the bytes available without swapping, within the limit of a container."""
     return min(filter(None, (_available(), _left_in_container())), default=_ASSUMED_FREE)
-
-
-def release_pages(array: np.ndarray) -> None:
-    """Return the memory of an array to the system; its values are lost, its owner must free it.
-
-    For arrays that someone else holds longer than they are needed. Whole pages, on Linux; nothing
-    happens elsewhere.
-    """
-    if sys.platform != "linux" or not array.flags.c_contiguous:
-        return
-    begin = array.ctypes.data
-    first = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE
-    last = (begin + array.nbytes) // mmap.PAGESIZE * mmap.PAGESIZE
-    if last > first:
-        place, size = ctypes.c_void_p(first), ctypes.c_size_t(last - first)
-        ctypes.CDLL(None).madvise(place, size, ctypes.c_int(mmap.MADV_DONTNEED))
 
 
 def _available() -> int:

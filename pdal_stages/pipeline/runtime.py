@@ -15,7 +15,7 @@ import json
 import sys
 import uuid
 from collections import ChainMap
-from collections.abc import Callable, Collection, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
@@ -125,8 +125,7 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
         label = str(arguments.get("label", ""))
         # PDAL's module object stays alive; the register need not grow.
         sys.modules.pop(label, None)
-        # Only the last may give memory of PDAL's arrays back, which it does with those of a dict.
-        seen = {**ins, **outs} if arguments is several[-1] else ChainMap(outs, cast(dict, ins))
+        seen = ChainMap(outs, cast(dict, ins))
         try:
             _run_interruptible(arguments, module, seen, outs)
         except BaseException as error:
@@ -170,7 +169,6 @@ def points_of(
     context: StageContext,
     module: Mapping[str, Any],
     ins: Mapping[str, Any],
-    lent_by_pdal: Set[str] = frozenset(),
 ) -> Points:
     """Return the points of a view, as a stage sees them; `module` are the script's globals."""
     metadata = module.get("metadata")
@@ -180,7 +178,6 @@ def points_of(
         wkt=wkt_of(module.get("spatialreference")),
         legacy_flags=pdal_env.flags_inside_classification(ins, metadata),
         overlap_as_flag=pdal_env.overlap_as_flag(ins, metadata),
-        lent_by_pdal=lent_by_pdal,
     )
 
 
@@ -206,8 +203,7 @@ def run_on_view(
     outs: dict[str, Any],
 ) -> Report:
     """Run a stage on one view; return its report."""
-    lent = ins.keys() - outs.keys() if isinstance(ins, dict) else frozenset()
-    points = points_of(stage, context, module, ins, lent)
+    points = points_of(stage, context, module, ins)
     _refuse_mixed_flags(points, pdal_env.point_formats(module.get("metadata")))
     for name in stage.reads():
         if name not in ins:

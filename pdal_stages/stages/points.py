@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.dimensions import is_height
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.memory import release_pages
 from ..base.messages import Report, shorten
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .options import Selection
@@ -75,8 +74,6 @@ class Points:
     #: In tiles: the points whose results are used.
     used: NDArray[np.bool_] | None = None
     code_limit: tuple[str, str] | None = None  #: as in :class:`.base.StageContext`
-    #: Which of the arrays are PDAL's, so that :meth:`keep_only` may give memory of the others back.
-    lent_by_pdal: Set[str] = frozenset()
 
     def __post_init__(self) -> None:
         """Evaluate `where`."""
@@ -159,12 +156,8 @@ class Points:
         """Forget the other dimensions, which nobody reads any more; keep `xyz`."""
         self.xyz  # noqa: B018  before they are gone
         self.__dict__.pop("axes", None)
-        kept, lent = set(names), self.arrays
-        self.arrays = {name: lent[name] for name in lent if name in kept}
-        # PDAL makes these arrays for this one call, and frees them after it.
-        for name in self.lent_by_pdal - kept:
-            if lent[name] is not self.meters_outside:
-                release_pages(lent[name])
+        kept, arrays = set(names), self.arrays
+        self.arrays = {name: arrays[name] for name in arrays if name in kept}
 
     def take_xyz(self) -> NDArray[np.float64]:
         """Return :attr:`xyz` and forget it, so that the caller can free its memory."""
