@@ -140,6 +140,8 @@ def with_types(
                 cure += "end. Otherwise give the stage a type: "
                 place = where(number) if where else None
                 raise PipelineError(what, where=place, found=name, cure=f'{cure}"{kind}s.las"')
+        if isinstance(named := stage.get("filename"), str) and named.startswith("~"):
+            stage["filename"] = os.path.join(".", named)  # PDAL takes ~ for somebody's home
         if stage["type"] == "readers.las" and not stage.keys() & {"extra_dims", "ignore_vlr"}:
             stage.setdefault("use_eb_vlr", True)  # else PDAL drops extra bytes of LAS 1.0-1.3
         out.append(stage)

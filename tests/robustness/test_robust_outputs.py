@@ -254,3 +254,21 @@ def test_a_run_works_in_a_folder_of_its_own(tmp_path, cloud):
             assert (notes / "kept" / "mine").read_text() == "mine"
     finally:
         os.umask(before)
+
+
+@pytest.mark.parametrize("door", ["classify", "pipeline", "objects", "review"])
+def test_names_that_begin_with_a_tilde(command, tmp_path, cloud, model, monkeypatch, door):
+    """PDAL takes it for somebody's home."""
+    monkeypatch.chdir(tmp_path)
+    las = laspy.read(cloud)
+    las.classification[:] = 2
+    las.write("~in.las")
+    (tmp_path / "job.json").write_text('["~in.las", {"type": "filters.hag_minima"}, "~out.las"]')
+    words = {
+        "classify": ["classify", "~in.las", "~out.las", "--model", model],
+        "pipeline": ["pipeline", "job.json"],
+        "objects": ["objects", "~in.las", "~out.gpkg"],
+        "review": ["review", "~in.las", "~out.gpkg", "--model", model],
+    }[door]
+    command.runs(words)
+    assert [path.name for path in tmp_path.glob("~out.*")]
