@@ -200,7 +200,7 @@ def test_files_without_points(tmp_path, run, write_las):
         (-0.1, "f8", "-0.1"),
     ],
 )
-@pytest.mark.parametrize("command", ["review", "objects", "accuracy"])
+@pytest.mark.parametrize("command", ["review", "objects", "accuracy", "corrections"])
 def test_a_reliability_beyond_0_to_1_is_refused(
     tmp_path, run, write_las, command, values, kind, shown
 ):
@@ -208,7 +208,13 @@ def test_a_reliability_beyond_0_to_1_is_refused(
     arrays = {"X": x, "Y": y, "Z": 0 * x, "Classification": np.full(len(x), 2, np.uint8)}
     arrays["Reliability"] = np.full(len(x), values, kind)
     source = str(write_las(tmp_path / "a.laz", arrays, point_format=6))
-    words = ["--reference", source] if command == "accuracy" else [str(tmp_path / "o.gpkg")]
+    words = [str(tmp_path / "o.gpkg")]
+    if command == "accuracy":
+        words = ["--reference", source]
+    if command == "corrections":
+        arrays["Classification"][:9] = 6
+        words = [str(write_las(tmp_path / "after.laz", arrays, point_format=6))]
+        words += ["--out", str(tmp_path / "o.gpkg.laz")]
     code, _, err = run(command, source, *words)
     assert code == 1 and "'Reliability' must be the probability" in err and shown in err
-    assert not (tmp_path / "o.gpkg").exists()
+    assert not [*tmp_path.glob("o.gpkg*")]

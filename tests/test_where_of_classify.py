@@ -154,3 +154,35 @@ def test_a_mark_is_no_dimension_that_is_there(tmp_path, run, run_job, write_las,
         code, _, err = run_job([reader, heights, classifier, out])
     assert code == 1 and "'mark' must name a new dimension" in err
     assert not out.exists()
+
+
+@pytest.mark.parametrize("tiles", [(), TILES])
+def test_points_are_selected_as_they_came_in(tmp_path, run, write_las, tiles):
+    """By the input's own heights, which are all 0, not by those of this run; for every step."""
+    xyz, _ = scene(0, 3.0)
+    zero = np.zeros(len(xyz), np.float32)
+    source = write(write_las, tmp_path / "in.las", xyz, 6, HeightAboveGround=zero)
+    out = tmp_path / "out.las"
+    code, _, err = run("classify", source, out, "--where", "HeightAboveGround > 2", *tiles)
+    assert code == 0 and "'where' matches no points: HeightAboveGround > 2" in err
+    assert (classes(out) == 1).all()
+    code, _, err = run("classify", source, out, "--where", "HeightAboveGround <= 2", *tiles)
+    assert code == 0 and (classes(out) != 1).mean() > 0.9
+
+
+@pytest.mark.parametrize("tiles", [(), TILES])
+@pytest.mark.parametrize(
+    "where", ["Reliability < 0.5", "Reliability >= 0.5", "HeightAboveGround > 2"]
+)
+def test_a_condition_on_what_the_input_lacks_is_refused(tmp_path, run, write_las, where, tiles):
+    xyz, _ = scene(0, 3.0)
+    source = write(write_las, tmp_path / "in.las", xyz, 6, mine=np.zeros(len(xyz)))
+    out = tmp_path / "out.las"
+    code, _, err = run("classify", source, out, "--where", where, *tiles)
+    name = where.split()[0]
+    assert (
+        code == 1 and f"'where' names the dimension '{name}', which the points do not have" in err
+    )
+    listed = err.partition("(found ")[2].partition(")")[0].split(", ")
+    assert {"X", "Classification", "mine"} <= {*listed} and name not in listed
+    assert not out.exists() and not any("PdalStages" in each for each in listed)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..base.las import named_copc, number_type
 from ..base.las_copy import LasCopy
 from ..base.las_points import PART, Layout, read_records
+from ..base.messages import shorten
 from ..stages.points import NO_POINT_MATCHES, SELECTED
 from ..stages.registry import stage_types
 from ..stages.where_expression import Expression
@@ -104,7 +105,7 @@ def describe_selection(where: str | None, known: Mapping[str, NDArray]) -> list[
     """Return a message where a condition selects no point."""
     chosen = known.get(SELECTED)
     nothing = chosen is not None and len(chosen) and not chosen.any()
-    return [f"{NO_POINT_MATCHES} {where}"] if nothing else []
+    return [f"{NO_POINT_MATCHES} {shorten(str(where))}"] if nothing else []
 
 
 def copy_of(

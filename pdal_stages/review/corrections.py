@@ -27,6 +27,7 @@ from ..pipeline.copies import copy_of, write_copy
 from ..pipeline.inputs_outputs import input_files, is_folder, outputs_of
 from ..pipeline.point_files import can_read_chunks
 from ..pipeline.spatial_reference import reference_of_file
+from ..stages.points import Points
 
 #: Share of points without a partner beyond which two files hold different points: large enough for
 #: points that a person deleted, small enough to notice another file; not tuned.
@@ -209,7 +210,12 @@ def _write(
     values = {"Classification": codes, CHECKED: checked.astype(np.uint8)}
     kinds = {CHECKED: "uint8_t"}
     if "Reliability" in layout.own:
-        values["Reliability"] = np.where(checked, 1.0, las["Reliability"])
+        arrays = {"X": las["X"], "Reliability": las["Reliability"]}
+        try:  # of per cent, 1 would be next to nothing
+            Points(arrays).reliability  # noqa: B018
+        except StageError as error:
+            raise error.at(str(las.path)) from None
+        values["Reliability"] = np.where(checked, 1.0, arrays["Reliability"])
         kinds["Reliability"] = "float"
     copy = copy_of(las.path, layout, output, kinds, {})
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import functools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,11 @@ class Expression:
         # Some names are words of Python.
         return f"_{token[0]}" if kind == "name" else _IN_PYTHON.get(token[0], token[0])
 
+    def check(self, names: Collection[str]) -> None:
+        """Refuse names that are not among those of dimensions; errors as of :meth:`evaluate`."""
+        for name in self._names:
+            _find(name, names)
+
     def evaluate(self, arrays: _Values) -> NDArray[np.bool_]:
         """Return which points (n,) meet the condition.
 
@@ -134,7 +139,7 @@ class Expression:
             return functools.reduce(function, others, first) if others else function(first)
 
 
-def _find(name: str, arrays: _Values) -> str:
+def _find(name: str, arrays: Collection[str]) -> str:
     """Return the dimension of a name, which PDAL takes in any case."""
     for known in (name, *arrays):
         if known.lower() == name.lower() and known in arrays:

@@ -10,12 +10,14 @@ from functools import cached_property
 from pathlib import Path
 
 from ..base import las
-from ..base.errors import OptionError, StageError
+from ..base.errors import DimensionError, OptionError, StageError
 from ..base.files import Output, check_outputs
+from ..base.las_points import layout_there
 from ..pipeline.classify_file import classify_file
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_folder, is_las, outputs_of
 from ..pipeline.pdal import knows_copc, writer_of
+from ..stages.where_expression import Expression
 from .inputs import InputSource, one_format
 from .jobs import Job, TiledRun
 from .options import TilingOptions, fits_whole
@@ -136,6 +138,7 @@ class ClassifyTask:
                 cure="Convert them first (pdal translate INPUT input.laz, of EPT a part with "
                 "--readers.ept.bounds), or classify them one at a time without tile options",
             )
+        self._refuse_other_dimensions()
         target = named = self.output
         if is_folder(self.output):
             target, named = str(Path(self.output) / ("#.laz" if self._per_tile else "#")), "x.laz"
@@ -169,3 +172,15 @@ class ClassifyTask:
             return run_plan(
                 plan, self.options, dry_run=dry_run, finished=finished, pipeline=pipeline
             )
+
+    def _refuse_other_dimensions(self) -> None:
+        """Refuse a `where` that names a dimension which an input does not have."""
+        if not self.request.where:
+            return
+        condition = Expression(self.request.where)
+        for path in self.files:
+            if layout := layout_there(path):
+                try:
+                    condition.check(layout.names)
+                except DimensionError as error:
+                    raise error.at(path) from None

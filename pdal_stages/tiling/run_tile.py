@@ -32,6 +32,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.las_copy import LasCopy
 from ..base.las_points import RecordColumns, SomeRows
+from ..base.messages import shorten
 from ..pipeline.copies import selection
 from ..pipeline.pdal_facts import check_outputs
 from ..pipeline.run import Pipeline
@@ -112,7 +113,7 @@ class _RoundRun:
                 self.needs_m += [distance_m + r.reach for r in stage.reports if r.beyond_halo]
         messages = _messages(pipeline, self.context.scratch)
         if plan.where and len(origins) and not any(each[SELECTED].any() for each in origins):
-            messages.append(f"{NO_POINT_MATCHES} {plan.where}")
+            messages.append(f"{NO_POINT_MATCHES} {shorten(plan.where)}")
         return RoundResult(
             _collect(self.views, self.pieces),
             max(self.needs_m),
