@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -199,7 +200,7 @@ class ClassifyRequest:
         for stage, name in zip(
             pipeline.source.stages[:: len(stages) - 1], (source, target), strict=True
         ):
-            if str(stage.get("filename")) != name:
+            if os.path.normpath(str(stage.get("filename"))) != os.path.normpath(name):
                 raise OptionError(
                     "classify names its files itself",
                     found=f"{stage['type']}.filename={stage.get('filename')}",
