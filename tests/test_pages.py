@@ -34,7 +34,6 @@ PAGES = {
     "docs/objects.md": 1,
     "docs/pipelines.md": 4,
     "docs/train.md": 5,
-    "docs/troubleshooting.md": 1,
 }
 
 
