@@ -235,7 +235,7 @@ def wire_error(heights: Heights) -> float:
     return heights.error(wires.find_wires(xyz, heights.height, use, wires.RULES), 14)
 
 
-def no_outliers(raster: np.ndarray, cell: float) -> np.ndarray:
+def no_outliers(raster: np.ndarray, *_: Any) -> np.ndarray:
     """Find no low outliers."""
     return np.zeros(raster.shape, bool)
 

@@ -6,6 +6,9 @@
     python benchmarks/whole_job.py --sizes 0.5 5 20
     # points per square meter, time per point
     python benchmarks/whole_job.py --densities 1 7 50 200 500
+    # a generated wood at 1.7 points/m2 side by side, or a real tile; 1, 2 and all threads
+    python benchmarks/whole_job.py --sparse --sizes 0.25 1 4 --threads 1 2 0 --model standard
+    python benchmarks/whole_job.py --sparse DATA/bridge/ign_0299_6802.laz --sizes 4 --model standard
     # CPU seconds of each part, one thread
     python benchmarks/whole_job.py --parts
     python benchmarks/whole_job.py --json FILE
@@ -34,6 +37,7 @@ from typing import Any
 
 import laspy
 import numpy as np
+from woods import closed_wood
 
 from pdal_stages import load_model
 from pdal_stages.base.version import __version__
@@ -64,6 +68,44 @@ def town(folder: Path, millions: float, density: float, seed: int) -> Path:
     return path
 
 
+def wood(folder: Path) -> Path:
+    """A generated closed wood on a slope, 300 m wide, at 1.7 points per square meter, made once."""
+    path = folder / "wood.laz"
+    if not path.exists():
+        xyz, _, _ = closed_wood(0.25, 1.7, 0.1, 1, 300.0)
+        las = laspy.create(point_format=6, file_version="1.4")
+        las.header.scales = np.full(3, 0.01)
+        las.xyz = xyz
+        las.return_number = las.number_of_returns = np.ones(len(xyz), np.uint8)
+        las.write(path)
+    return path
+
+
+def side_by_side(folder: Path, source: Path, millions: float) -> Path:
+    """Copies of a cloud set side by side in a square, each shifted by whole meters, made once."""
+    path = folder / f"{source.stem}-{millions:g}.laz"
+    if path.exists():
+        return path
+    las, count = laspy.read(source), int(millions * 1e6)
+    points, scales = las.points.array, las.header.scales
+    side = np.ceil(las.header.maxs - las.header.mins)
+    across = int(np.ceil((count / len(points)) ** 0.5))
+    parts = []
+    for number in range(-(-count // len(points))):
+        part, (row, column) = points.copy(), divmod(number, across)
+        part["X"] += round(column * side[0] / scales[0])
+        part["Y"] += round(row * side[1] / scales[1])
+        parts.append(part)
+    header = las.header
+    record = laspy.ScaleAwarePointRecord(
+        np.concatenate(parts)[:count], header.point_format, scales, header.offsets
+    )
+    joined = laspy.LasData(header, record)
+    joined.update_header()
+    joined.write(path)
+    return path
+
+
 def trained(folder: Path) -> Path:
     """A model with all defaults, trained once on a town of half a million points."""
     path = folder / f"defaults-{__version__}.model"
@@ -79,13 +121,14 @@ def trained(folder: Path) -> Path:
     return path
 
 
-def once(cloud: Path, model: str, out: Path) -> dict[str, float]:
+def once(cloud: Path, model: str, out: Path, threads: int) -> dict[str, float]:
     """Wall and CPU seconds of one run, and the most memory of it in MiB."""
     began = time.perf_counter()
     process = subprocess.Popen(
         command("classify", cloud, out, "--model", model),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
+        env={**os.environ, **({"LOKY_MAX_CPU_COUNT": str(threads)} if threads else {})},
     )
     assert process.stderr is not None
     errors = process.stderr.read()
@@ -96,13 +139,13 @@ def once(cloud: Path, model: str, out: Path) -> dict[str, float]:
     return {"wall": wall, "cpu": usage.ru_utime + usage.ru_stime, "memory": usage.ru_maxrss / 1024}
 
 
-def measured(cloud: Path, model: str, repeats: int) -> dict[str, Any]:
-    """Some runs over a cloud."""
+def measured(cloud: Path, model: str, repeats: int, threads: int) -> dict[str, Any]:
+    """Some runs over a cloud with some threads; 0: all."""
     with laspy.open(cloud) as reader:
         points = reader.header.point_count
     with tempfile.TemporaryDirectory() as folder:
-        runs = [once(cloud, model, Path(folder, "out.laz")) for _ in range(repeats)]
-    line: dict[str, Any] = {"cloud": cloud.name, "points": points}
+        runs = [once(cloud, model, Path(folder, "out.laz"), threads) for _ in range(repeats)]
+    line: dict[str, Any] = {"cloud": cloud.name, "points": points, "threads": threads}
     for key in ("wall", "cpu", "memory"):
         values = [run[key] for run in runs]
         line[key] = [min(values), statistics.median(values), max(values)]
@@ -112,15 +155,15 @@ def measured(cloud: Path, model: str, repeats: int) -> dict[str, Any]:
 def table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table."""
     out = [
-        "| cloud | points | wall s | CPU s | CPU microseconds a point | memory, MiB | bytes a "
-        "point |",
-        "|---|---:|---:|---:|---:|---:|---:|",
+        "| cloud | points | threads | wall s | CPU s | CPU microseconds a point | memory, MiB | "
+        "bytes a point |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for line in lines:
         wall, cpu = (" / ".join(f"{v:.1f}" for v in line[key]) for key in ("wall", "cpu"))
         memory, points = line["memory"][1], line["points"]
         out.append(
-            f"| {line['cloud']} | {points:,} | {wall} | {cpu} | "
+            f"| {line['cloud']} | {points:,} | {line['threads'] or 'all'} | {wall} | {cpu} | "
             f"{1e6 * line['cpu'][1] / points:.1f} | {memory:.0f} | "
             f"{memory * 2**20 / points:.0f} |"
         )
@@ -196,6 +239,14 @@ def main() -> None:
     )
     options.add_argument("--sizes", type=float, nargs="+", help="millions of points")
     options.add_argument("--densities", type=float, nargs="+", help="points per square meter")
+    options.add_argument(
+        "--sparse",
+        nargs="?",
+        const="",
+        metavar="FILE",
+        help="a cloud set side by side: a generated wood, or FILE",
+    )
+    options.add_argument("--threads", type=int, nargs="+", default=[0], help="0: all")
     options.add_argument("--parts", action="store_true")
     options.add_argument("--model", help="a model file, or standard; by default one is trained")
     options.add_argument("--repeats", type=int, default=3)
@@ -214,11 +265,18 @@ def main() -> None:
         for name, seconds in result["parts"].items():
             print(f"{name:<28}{seconds:6.2f} CPU s")
     else:
-        if arguments.densities:
+        if arguments.sparse is not None:
+            source = Path(arguments.sparse) if arguments.sparse else wood(arguments.folder)
+            clouds = [side_by_side(arguments.folder, source, n) for n in arguments.sizes or [1]]
+        elif arguments.densities:
             clouds = [town(arguments.folder, 0.5, density, 2) for density in arguments.densities]
         else:
             clouds = [town(arguments.folder, size, 7.0, 2) for size in arguments.sizes or [0.5]]
-        result["runs"] = [measured(cloud, model, arguments.repeats) for cloud in clouds]
+        result["runs"] = [
+            measured(cloud, model, arguments.repeats, threads)
+            for cloud in clouds
+            for threads in arguments.threads
+        ]
         print(table(result["runs"]))
     if arguments.json:
         arguments.json.write_text(json.dumps(result, indent=1) + "\n")

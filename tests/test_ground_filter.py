@@ -15,7 +15,7 @@ import pdal_stages as ps
 from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.grid import GridWindow
 from pdal_stages.stages.hag_morphological import HagMorphological
-from pdal_stages.terrain import filtered_ground, wide_roofs
+from pdal_stages.terrain import filtered_ground, openings, wide_roofs
 from pdal_stages.terrain.filter_options import FilterOptions
 from pdal_stages.terrain.openings import FILL_RINGS, fill_holes, growing_radii, objects_of
 from pdal_stages.terrain.smrf import reach_of_points
@@ -76,9 +76,11 @@ def test_holes_are_filled_up_to_some_rings_from_measured_cells():
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 2), (45, 38), (60, 50)])
+@pytest.mark.parametrize("band", [1, 1 << 19])
 @np.errstate(invalid="ignore")
-def test_openings_and_objects_equal_the_slow_reference(shape):
-    """The last of them is as steep as mountains."""
+def test_openings_and_objects_equal_the_slow_reference(shape, band, monkeypatch):
+    """The last of them is as steep as mountains; in bands of rows, too."""
+    monkeypatch.setattr(openings, "_BAND_CELLS", band)
     rng = np.random.default_rng(1)
     raster = (rng.normal(0, 3, shape) + np.arange(shape[1]) * 1.7 * (shape[0] == 60)).astype(
         np.float32

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 from unittest import mock
 
 import laspy
@@ -56,14 +57,30 @@ def shown(step, points, raster):
 # ---- no farther ------------------------------------------------------------------------------------------
 
 
+class Planes(NamedTuple):
+    """A surface whose planes are all given."""
+
+    window: GridWindow
+    every: np.ndarray
+
+    def planes(self, rows):
+        return self.every[rows]
+
+
+def every_plane(raster):
+    return raster.surface.planes(slice(0, raster.surface.window.height))
+
+
 def outside(raster, other, away, reach):
     """Return a raster with another one's cells beyond the reach."""
     far = away > reach
     cells = {}
-    for name in ("lowest", "place", "ground", "floor", "planes"):
+    for name in ("lowest", "place", "ground", "floor"):
         one, two = getattr(raster, name), getattr(other, name)
-        if one is not None:
-            cells[name] = np.where(far.reshape(*far.shape, *[1] * (one.ndim - 2)), two, one)
+        cells[name] = np.where(far.reshape(*far.shape, *[1] * (one.ndim - 2)), two, one)
+    if raster.surface is not None:
+        one, two = (every_plane(each) for each in (raster, other))
+        cells["surface"] = Planes(raster.window, np.where(far[..., None], two, one))
     opened = {r: np.where(far, other.opened[r], values) for r, values in raster.opened.items()}
     return replace(raster, opened=opened, **cells)
 
@@ -137,7 +154,8 @@ def raster_of(lowest, ground=None, planes=None):
     place[..., 2] = np.where(lowest < HOLE, lowest, 0.0)
     ground = np.isfinite(lowest) if ground is None else ground
     window = GridWindow(-MIDDLE, -MIDDLE, SIDE, SIDE)
-    return GroundRaster(window, lowest, place, ground, lowest, {}, planes)
+    surface = None if planes is None else Planes(window, planes)
+    return GroundRaster(window, lowest, place, ground, lowest, {}, surface)
 
 
 def lone_ground(away, height):
@@ -255,7 +273,8 @@ def test_a_part_with_its_surroundings_is_made_as_in_the_whole():
             points, holes(window), wanted, lambda name, *made: kept.update({name: made})
         )
     assert part.window == wanted and list(kept) == STEPS
-    assert np.array_equal(part.planes, whole.planes[wanted.slices_in(window)], equal_nan=True)
+    want = chain.steps[-1].shows(whole)[wanted.slices_in(window)]
+    assert np.array_equal(chain.steps[-1].shows(part), want, equal_nan=True)
     sizes = [made[0].width for made in kept.values()]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > sizes[-1]
 

@@ -73,7 +73,9 @@ class HagMorphological(FarReaching, settings=FilterOptions):
             folder = Path(self.keep_rasters)
             check_writable(folder / "x.tif" if folder.is_dir() else folder, "raster")
         self._filter = FilterOptions(
-            **{name: self.options[name] for name in _FILTER}, slope_too=self.terrain_slope
+            **{name: self.options[name] for name in _FILTER},
+            slope_too=self.terrain_slope,
+            threads=self.threads,
         )
 
     def written_dimensions(self) -> Sequence[Dimension]:
@@ -147,7 +149,6 @@ class HagMorphological(FarReaching, settings=FilterOptions):
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
             **{**vars(self._filter), "keep": self._write_rasters(points)},
-            threads=self.threads,
             cells=None if context.blocks is None else GroundCells(context.blocks),
             figures=points.report.figures,
             ground=ground if ground is None or all_wanted else ground[wanted],

@@ -64,6 +64,7 @@ class FilterOptions(Settings):
     )
     slope_too: bool = False  #: whether the terrain's slope is wanted
     keep: Keep | None = None  #: receives what each step made of each piece of the cloud
+    threads: int | None = None  #: None or 0: every available core
 
     def __post_init__(self) -> None:
         """Refuse wrong sizes."""

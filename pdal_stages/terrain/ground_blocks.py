@@ -24,11 +24,10 @@ from .smrf import (
     PROVISIONAL,
     cell_steps,
     ground_filter,
-    heights_of,
     holes,
 )
 from .steps import Chain
-from .surface import GroundRaster
+from .surface import GroundRaster, heights_above
 from .wide_roofs import lowest_of_coarse_cells
 
 #: Side of a block in cells: larger ones take more memory, smaller ones more time; not tuned.
@@ -84,8 +83,9 @@ class GroundCells:
                 for field, rasters in (("opened", opened.values()), ("kept", steps)):
                     for k, values in enumerate(rasters):
                         values[at] = cells[field][:, k]
-        means = out.pop("held"), out.pop("means")
-        return KnownCells(GroundRaster(window, **out, opened=opened), means, steps)
+        lowest, place, ground, floor, held, means = (out[name] for name in _FILLED)
+        raster = GroundRaster(window, lowest, place, ground, floor, opened)
+        return KnownCells(raster, (held, means), steps)
 
 
 #: Fields of a record that fill rasters of their own.
@@ -225,9 +225,11 @@ def _judged(
     parts: Iterable[NDArray[np.float64]], raster: GroundRaster, options: FilterOptions
 ) -> Iterator[tuple[GroundPoints, NDArray[np.bool_]]]:
     """Yield parts of points (n, 3), and which are ground by the surface of a raster."""
+    assert raster.surface is not None
     for xyz in parts:
         points = _in_cells(xyz, options)
-        above = heights_of(points, raster, options.cell, threads=1)
+        x, y, z, _, _, row = points
+        above = heights_above(x, y, z, row, raster.surface, options.cell, options.threads)
         yield points, options.is_ground(points.use, *above)
 
 

@@ -28,7 +28,6 @@ classification of airborne LIDAR data. ISPRS Journal of Photogrammetry and Remot
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,24 +45,27 @@ from .smrf import (
     cell_steps,
     given_steps,
     ground_filter,
-    heights_of,
     holes,
     reach_of_cells,
     reach_of_given,
     reach_of_points,
     surface_steps,
 )
-from .steps import Chain
-from .surface import GroundRaster
+from .surface import GroundRaster, GroundSurface, LevelSurface, heights_above
+
+#: Cells per point of rasters that are filtered in one piece, and cells of the largest: they take
+#: some 90 bytes a cell. Surroundings of squares would cost 2.3 times the work. Not tuned.
+MAX_CELLS_PER_POINT = 2.5
+MAX_CELLS = 50_000_000
 
 
 class _Piece(NamedTuple):
-    """A piece of a cloud, its ground, and the steps that are left to do."""
+    """A piece of a cloud and the surface through its ground."""
 
     rows: Any  #: indices of its points, and of those around that matter; or a slice
     core: Any  #: which of these belong to the piece, or a slice
+    points: GroundPoints
     raster: GroundRaster
-    steps: Chain
 
 
 def filtered_ground(
@@ -74,7 +76,6 @@ def filtered_ground(
     mask: ArrayLike | None = None,
     ground: ArrayLike | None = None,
     cells: GroundCells | None = None,
-    threads: int | None = None,
     figures: dict[str, Any] | None = None,
     **options: Any,
 ) -> dict[str, NDArray]:
@@ -92,8 +93,6 @@ def filtered_ground(
     cells : GroundCells, optional
         Cells of known ground (:func:`.ground_blocks.cells_of_block`), all within the
         `reach_of_cells` of :class:`.FilterOptions` of the points, which then need no others around.
-    threads : int, optional
-        None or 0: every available core.
     figures : dict, optional
         Receives counts: ``ground_points``, ``without_terrain`` (points with no ground near; their
         height is 0), ``unused_points``.
@@ -119,8 +118,8 @@ def filtered_ground(
     known = None if ground is None else (usable(x, y, z, mask=ground) & use)[rows]
     points = GroundPoints.in_cells(x[rows], y[rows], z[rows], use[rows], settings.cell)
     counts = {} if figures is None else figures
-    pieces = _pieces(points, settings, known, cells, threads)
-    out = _heights(points, settings, pieces, threads, counts)
+    pieces = _pieces(points, settings, known, cells)
+    out = _heights(points, settings, pieces, counts)
     if known is not None:
         out["Ground"][known] = 1
     counts["ground_points"] = int(np.count_nonzero(out["Ground"]))
@@ -140,21 +139,19 @@ def _pieces(
     options: FilterOptions,
     ground: NDArray[np.bool_] | None,
     cells: GroundCells | None,
-    threads: int | None,
 ) -> Iterator[_Piece]:
     """Return the pieces of a cloud, with ground that is given, known or found."""
     if ground is not None:
-        return _given_pieces(points, options, ground, threads)
+        return _given_pieces(points, options, ground)
     if cells is not None:
-        return _known_pieces(points, options, cells, threads)
-    return _filtered_pieces(points, options, threads)
+        return _known_pieces(points, options, cells)
+    return _filtered_pieces(points, options)
 
 
 def _heights(
     points: GroundPoints,
     options: FilterOptions,
     pieces: Iterable[_Piece],
-    threads: int | None,
     counts: dict[str, int],
 ) -> dict[str, NDArray]:
     """Compute the heights of the points of pieces; add to `counts`."""
@@ -166,15 +163,12 @@ def _heights(
         **({"Slope": np.zeros(count)} if options.slope_too else {}),
         **{opening(width).name: np.zeros(count, np.float32) for width in options.openings},
     }
-    for piece in pieces if count else ():
-        part = points.take(piece.rows)
-        own = _cut_to(_window_of(part, piece.core), options.keep)
-        raster = piece.steps.run(part, piece.raster, keep=own)
-        dimensions, nowhere = _measure(part, raster, options, threads)
-        counts["without_terrain"] += int(np.count_nonzero(nowhere[piece.core]))
-        rows = piece.rows if isinstance(piece.rows, slice) else piece.rows[piece.core]
+    for rows, core, part, raster in pieces if count else ():
+        dimensions, nowhere = _measure(part, raster, options)
+        counts["without_terrain"] += int(np.count_nonzero(nowhere[core]))
+        own = rows if isinstance(rows, slice) else rows[core]
         for name, values in dimensions.items():
-            out[name][rows] = values[piece.core]
+            out[name][own] = values[core]
     return out
 
 
@@ -193,30 +187,30 @@ def _window_of(points: GroundPoints, rows: Any = slice(None)) -> GridWindow:
     return GridWindow.enclosing(points.column[rows], points.row[rows])
 
 
-def _filtered_pieces(
-    points: GroundPoints, options: FilterOptions, threads: int | None
-) -> Iterator[_Piece]:
+def _filtered_pieces(points: GroundPoints, options: FilterOptions) -> Iterator[_Piece]:
     """Yield pieces of the cloud with the ground that the filter finds."""
     cells, gap = cell_steps(options), ground_filter(options).gap
-    measure = surface_steps(options, cells.last, threads)
-    for rows, core in patches(points.column, points.row, reach_of_points(options), gap):
+    measure = surface_steps(options, cells.last)
+    largest = int(min(MAX_CELLS_PER_POINT * len(points.x), MAX_CELLS))
+    for rows, core in patches(points.column, points.row, reach_of_points(options), gap, largest):
         part, wanted = points.take(rows), None
         own = _window_of(part, core)
         window = _window_of(part).padded(FILL_RINGS + 1)
+        near, keep = part, _cut_to(own, options.keep)
         # Points farther away only tell which cells are ground.
         if not isinstance(rows, slice) and not isinstance(core, slice):
             wanted = own.padded(reach_of_cells(options, cells.last))
             seen = wanted.contains(part.column, part.row)
-            rows, core = rows[seen], core[seen]
-        raster = cells.run(part, holes(window), wanted, _cut_to(own, options.keep))
-        yield _Piece(rows, core, raster, measure)
+            rows, core, near = rows[seen], core[seen], part.take(seen)
+        # The raster in between has no name: it takes as much memory as all else.
+        raster = measure.run(near, cells.run(part, holes(window), wanted, keep), keep=keep)
+        yield _Piece(rows, core, near, raster)
 
 
 def _known_pieces(
     points: GroundPoints,
     options: FilterOptions,
     cells: GroundCells,
-    threads: int | None,
 ) -> Iterator[_Piece]:
     """Yield pieces of the cloud with the ground raster that an earlier round computed."""
     steps = cell_steps(options)
@@ -227,30 +221,42 @@ def _known_pieces(
         for step, values in zip(steps.steps, known.kept, strict=False):
             if options.keep is not None:
                 options.keep(step.name, window, values[window.slices_in(known.raster.window)])
-        steps_left = surface_steps(options, steps.last, threads, known.means)
-        yield _Piece(rows, core, known.raster, steps_left)
+        part = points.take(rows)
+        keep = _cut_to(_window_of(part, core), options.keep)
+        measure = surface_steps(options, steps.last, known.means)
+        yield _Piece(rows, core, part, measure.run(part, known.raster, keep=keep))
 
 
 def _given_pieces(
-    points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_], threads: int | None
+    points: GroundPoints, options: FilterOptions, ground: NDArray[np.bool_]
 ) -> Iterator[_Piece]:
     """Yield pieces of the cloud whose `ground` points (n,) are given."""
     gap = given_steps(options, ground).gap
     margin = FILL_RINGS + 2 + max([0, *options.requested_radii])
     for rows, core in patches(points.column, points.row, reach_of_given(options), gap):
         window = _window_of(points, rows).padded(margin)
-        yield _Piece(rows, core, holes(window), given_steps(options, ground[rows], threads))
+        part = points.take(rows)
+        keep = _cut_to(_window_of(part, core), options.keep)
+        raster = given_steps(options, ground[rows]).run(part, holes(window), keep=keep)
+        yield _Piece(rows, core, part, raster)
 
 
 def _measure(
-    points: GroundPoints, raster: GroundRaster, options: FilterOptions, threads: int | None
+    points: GroundPoints, raster: GroundRaster, options: FilterOptions
 ) -> tuple[dict[str, NDArray], NDArray[np.bool_]]:
     """Return the dimensions of points above the surface of a raster, and which have none near.
 
     The height of these (n,) is 0.
     """
-    assert raster.is_ground is not None and raster.planes is not None
-    height, gradient = heights_of(points, raster, options.cell, threads)
+    assert raster.is_ground is not None and raster.surface is not None
+    x, y, z, _, _, row = points
+
+    def above(
+        surface: GroundSurface | LevelSurface,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return heights_above(x, y, z, row, surface, options.cell, options.threads)
+
+    height, gradient = above(raster.surface)
     nowhere = np.isnan(height)
     height[nowhere] = gradient[nowhere] = 0.0
     out: dict[str, NDArray] = {
@@ -259,10 +265,7 @@ def _measure(
     }
     if options.slope_too:
         out["Slope"] = np.degrees(np.arctan(gradient))
-    planes = np.zeros_like(raster.planes)
     for width, radius in zip(options.openings, options.requested_radii, strict=True):
-        opened = raster.opened[radius]
-        planes[..., 0] = np.where(np.isfinite(opened), opened, np.nan)
-        values, _ = heights_of(points, replace(raster, planes=planes), options.cell, threads)
+        values, _ = above(LevelSurface(raster.window, raster.opened[radius]))
         out[opening(width).name] = np.where(np.isnan(values), height, values).astype(np.float32)
     return out, nowhere

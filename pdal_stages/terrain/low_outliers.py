@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import FAST, device, njit
+from ..base.threads import map_blocks
 from .cells import HOLE
 from .components import linked_cells
 from .openings import highest_around
@@ -51,6 +52,10 @@ class LowRules(NamedTuple):
 
 
 RULES = LowRules()
+#: How often what lies around a rank is halved before it is looked at; results do not depend on it.
+_HALVINGS = 8
+#: Rows that a thread takes at a time; results do not depend on it.
+_BAND = 32
 
 
 def reach(side: float) -> int:
@@ -58,55 +63,101 @@ def reach(side: float) -> int:
     return RULES.near + math.ceil(RULES.far_m / side) + RULES.support
 
 
-@device(_nrt=True, fastmath=set(FAST))
-def _plane_under(low, j, i, rules):
+@device
+def _columns_around(low, j, i, radius, near):
+    """Copy the columns with points around one: dx, dy and height to `near` (3, m); their number."""
+    h, w = low.shape
+    n = 0
+    for b in range(max(-radius, -j), min(radius + 1, h - j)):
+        half = int(np.sqrt(float(radius * radius - b * b)))
+        for a in range(max(-half, -i), min(half + 1, w - i)):
+            near[0, n], near[1, n], near[2, n] = a, b, low[j + b, i + a]
+            n += low[j + b, i + a] < np.inf
+    return n
+
+
+@device
+def _value_of_rank(values, high, rank):
+    """Return the value (n,) of a rank; values lie from 0 to `high`.
+
+    What lies around it is halved by counting, which needs no branches: it costs less than sorting.
+    """
+    low = -1.0
+    while True:
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            count = 0
+            for k in range(len(values)):
+                count += values[k] <= middle
+            if rank < count:
+                high = middle
+            else:
+                low = middle
+        first, last = np.inf, -np.inf
+        for k in range(len(values)):
+            if low < values[k] <= high:
+                first, last = min(first, values[k]), max(last, values[k])
+        if first == last:
+            return first
+
+
+@device(fastmath=set(FAST))
+def _plane_of_sums(sums, level_weight):
+    """Solve the normal equations of a plane by Cramer's rule: height, rise per column and row."""
+    s0, s1, s2, s11, s12, s22, t0, t1, t2 = sums
+    s11, s22 = s11 + level_weight * s0, s22 + level_weight * s0
+    c0 = s11 * s22 - s12 * s12
+    c1 = s12 * s2 - s1 * s22
+    c2 = s1 * s12 - s11 * s2
+    det = s0 * c0 + s1 * c1 + s2 * c2
+    return (
+        (t0 * c0 + t1 * c1 + t2 * c2) / det,
+        (t0 * c1 + t1 * (s0 * s22 - s2 * s2) + t2 * (s1 * s2 - s0 * s12)) / det,
+        (t0 * c2 + t1 * (s1 * s2 - s0 * s12) + t2 * (s0 * s11 - s1 * s1)) / det,
+    )
+
+
+@device(fastmath=set(FAST) | {"nnan"})
+def _plane_under(low, j, i, rules, near):
     """Fit a plane under the columns around one: return its height there, and its rise per column.
 
     Iteratively reweighted least squares; the height is -inf where there are too few columns.
+    `near` (3, m) is working memory.
     """
-    h, w = low.shape
-    u, v, zs = np.empty((3, (2 * rules.near + 1) ** 2))
-    n, radius = 0, rules.near
-    for b in range(max(-radius, -j), min(radius + 1, h - j)):
-        for a in range(max(-radius, -i), min(radius + 1, w - i)):
-            if low[j + b, i + a] < np.inf and a * a + b * b <= radius * radius:
-                u[n], v[n], zs[n] = a, b, low[j + b, i + a]
-                n += 1
+    n = _columns_around(low, j, i, rules.near, near)
     if n < rules.min_columns:
         return -np.inf, 0.0, 0.0
-    lowest = zs[:n].min()
-    zs = zs[:n] - lowest
-    order = np.sort(zs)
-    trusted = zs >= order[n // rules.first_lowest]
-    trusted &= zs <= order[n // rules.first_highest]
-    weight = np.where(trusted, 1.0, rules.first_weight)
+    u, v, zs = near[0, :n], near[1, :n], near[2, :n]
+    lowest = highest = zs[0]
+    for k in range(n):
+        lowest, highest = min(lowest, zs[k]), max(highest, zs[k])
+    for k in range(n):
+        zs[k] -= lowest
+    highest_trusted = _value_of_rank(zs, highest - lowest, n // rules.first_highest)
+    lowest_trusted = _value_of_rank(zs, highest_trusted, n // rules.first_lowest)
     p0 = p1 = p2 = 0.0
-    for _ in range(rules.fits):
+    for fit in range(rules.fits):
         s0 = s1 = s2 = s11 = s12 = s22 = t0 = t1 = t2 = 0.0
         for k in range(n):
-            g = weight[k]
+            x, y, z = u[k], v[k], zs[k]
+            if fit == 0:
+                g = 1.0 if lowest_trusted <= z <= highest_trusted else rules.first_weight
+            else:
+                off = z - p0 - p1 * x - p2 * y
+                g = 1.0 / (1.0 + off * off)
+                g = g * g if off < 0.0 else rules.above_weight * g
+            gx, gy = g * x, g * y
             s0 += g
-            s1 += g * u[k]
-            s2 += g * v[k]
-            s11 += g * u[k] * u[k]
-            s12 += g * u[k] * v[k]
-            s22 += g * v[k] * v[k]
-            t0 += g * zs[k]
-            t1 += g * u[k] * zs[k]
-            t2 += g * v[k] * zs[k]
-        s11, s22 = s11 + rules.level_weight * s0, s22 + rules.level_weight * s0
-        # Cramer's rule.
-        c0 = s11 * s22 - s12 * s12
-        c1 = s12 * s2 - s1 * s22
-        c2 = s1 * s12 - s11 * s2
-        det = s0 * c0 + s1 * c1 + s2 * c2
-        p0 = (t0 * c0 + t1 * c1 + t2 * c2) / det
-        p1 = (t0 * c1 + t1 * (s0 * s22 - s2 * s2) + t2 * (s1 * s2 - s0 * s12)) / det
-        p2 = (t0 * c2 + t1 * (s1 * s2 - s0 * s12) + t2 * (s0 * s11 - s1 * s1)) / det
-        for k in range(n):
-            off = zs[k] - p0 - p1 * u[k] - p2 * v[k]
-            g = 1.0 / (1.0 + off * off)
-            weight[k] = g * g if off < 0.0 else rules.above_weight * g
+            s1 += gx
+            s2 += gy
+            s11 += gx * x
+            s12 += gx * y
+            s22 += gy * y
+            t0 += g * z
+            t1 += gx * z
+            t2 += gy * z
+        sums = s0, s1, s2, s11, s12, s22, t0, t1, t2
+        p0, p1, p2 = _plane_of_sums(sums, rules.level_weight)
     return p0 + lowest, p1, p2
 
 
@@ -133,7 +184,10 @@ def _has_company(base, supported, side, j, i, z, plane, rules):
     h, w = base.shape
     far, company = int(np.ceil(rules.far_m / side)), 0
     least = rules.company_depth * (plane[0] - z)
-    for b in range(max(j - far, 0), min(j + far + 1, h)):
+    for step in range(2 * far + 1):  # rows outward: most company is near
+        b = j + (step + 1) // 2 * (1 - 2 * (step & 1))
+        if b < 0 or b >= h:
+            continue
         for a in range(max(i - far, 0), min(i + far + 1, w)):
             if not supported[b, a]:
                 continue
@@ -141,26 +195,29 @@ def _has_company(base, supported, side, j, i, z, plane, rules):
             below = plane[0] + plane[1] * (a - i) + plane[2] * (b - j) - base[b, a]
             most = z + min(least, rules.level_m + rules.max_rise * away)
             company += away <= rules.far_m and base[b, a] <= most and below >= least
-    return company >= rules.min_company
+        if company >= rules.min_company:
+            return True
+    return False
 
 
 @njit
-def _limits(low, base, supported, side, depth, limit, rules):
+def _limits(low, base, supported, side, depth, rules, first, limit):
     """Fill `limit`: below it low places are outliers; -inf where one may be ground."""
-    for j in range(low.shape[0]):
+    near = np.empty((3, (2 * rules.near + 1) ** 2))
+    for j in range(first, first + len(limit)):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:
                 continue
-            plane = _plane_under(base, j, i, rules)
+            plane = _plane_under(base, j, i, rules, near)
             lowest = plane[0] - depth
             if low[j, i] < lowest and not _has_company(
                 base, supported, side, j, i, low[j, i], plane, rules
             ):
-                limit[j, i] = lowest
+                limit[j - first, i] = lowest
 
 
 def limits_below_ground(
-    low: NDArray, base: NDArray, side: float, depth: float = 1.0
+    low: NDArray, base: NDArray, side: float, depth: float = 1.0, threads: int | None = 1
 ) -> NDArray[np.float64]:
     """Return the heights (h, w) below which low places are outliers, in meters; -inf where none is.
 
@@ -171,16 +228,26 @@ def limits_below_ground(
         is none.
     side, depth : float
         Side of a column, and least depth of outliers below the ground, in meters.
+    threads : int, optional
+        Each takes some rows.
     """
     limit = np.full(low.shape, -np.inf)
     # Where all around lies lower, no plane through it runs above.
     heights = np.where(np.isfinite(base), base, -HOLE).astype(np.float32)
     low = np.where(low < highest_around(heights, RULES.near, 0), low, np.inf)
-    _limits(low, base, _supported(base, RULES), side, depth, limit, RULES)
+    supported = _supported(base, RULES)
+
+    def judge(first: int) -> None:
+        rows = limit[first : first + _BAND]
+        _limits(low, base, supported, side, depth, RULES, first, rows)
+
+    list(map_blocks(judge, range(0, len(low), _BAND), threads))
     return limit
 
 
-def find_low_outliers(raster: NDArray[np.float32], cell: float) -> NDArray[np.bool_]:
+def find_low_outliers(
+    raster: NDArray[np.float32], cell: float, threads: int | None = 1
+) -> NDArray[np.bool_]:
     """Find the cells (h, w) of a minimum grid whose lowest point is a low outlier.
 
     Only small sets of cells that no small step links to others are judged. The raster is in meters,
@@ -195,7 +262,7 @@ def find_low_outliers(raster: NDArray[np.float32], cell: float) -> NDArray[np.bo
     if not island.any():
         return island
     low, base = np.where(island, raster, HOLE), np.where(island, HOLE, raster)
-    return limits_below_ground(low, base, cell) > -np.inf
+    return limits_below_ground(low, base, cell, threads=threads) > -np.inf
 
 
 def outlier_reach(cell: float) -> int:

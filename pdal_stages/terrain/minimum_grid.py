@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,17 +48,18 @@ def minimum_grid(points: GroundPoints, window: GridWindow, cell: float) -> Groun
 
     All of them are ground, until later steps find objects. `cell` is the side of a cell in meters.
     """
-    usable = np.flatnonzero(points.use & window.contains(points.column, points.row))
-    inside = window.flat_index(points.column[usable], points.row[usable])
-    x, y, z = (axis[usable] for axis in points[:3])
+    use = points.use & window.contains(points.column, points.row)
+    usable: Any = slice(None) if use.all() else np.flatnonzero(use)  # no copy of all points
+    x, y, z, _, column, row = points.take(usable)
+    inside = window.flat_index(column, row)
     low = lowest_points(x, y, z, inside, window.width * window.height).reshape(window.shape)
     ground = low >= 0
-    rows = usable[low[ground]]
+    rows = low[ground]
     lowest, place = np.full(window.shape, HOLE), np.zeros((*window.shape, 3))
-    lowest[ground] = points.z[rows]
-    place[ground, 0] = points.x[rows] / cell - points.column[rows] - 0.5
-    place[ground, 1] = points.y[rows] / cell - points.row[rows] - 0.5
-    place[ground, 2] = points.z[rows]
+    lowest[ground] = z[rows]
+    place[ground, 0] = x[rows] / cell - column[rows] - 0.5
+    place[ground, 1] = y[rows] / cell - row[rows] - 0.5
+    place[ground, 2] = z[rows]
     return GroundRaster(window, lowest, place, ground, lowest, {})
 
 
@@ -90,7 +91,7 @@ def ground_means(
 
     Parts are points, and which of them are ground.
     """
-    count, place = np.zeros(window.shape, np.int64), np.zeros((*window.shape, 3))
+    count, place = np.zeros(window.shape, np.int32), np.zeros((*window.shape, 3))
     for points, is_ground in parts:
         _add_ground(points, is_ground, cell, window[:2], count, place)
     held = count > 0

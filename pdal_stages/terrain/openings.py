@@ -17,11 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.jit import njit
+from ..base.threads import map_blocks
 from .cells import HOLE
 
 #: Cells beyond measured ones, along both axes and diagonals, up to which holes are filled. Clips
 #: with holes lose 0.3 points with 2, surveys 0.4 with 8, and clips and the ISPRS samples without.
 FILL_RINGS = 3
+#: Cells of the rows that a thread takes at a time; results do not depend on it.
+_BAND_CELLS = 1 << 19
 
 
 def growing_radii(largest: int) -> list[int]:
@@ -44,8 +47,28 @@ def _steps(radius: int) -> tuple[int, int]:
     return squares, radius - squares
 
 
-def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray[Any]:
+def highest_around(
+    raster: NDArray[Any], squares: int, diamonds: int, threads: int | None = 1
+) -> NDArray[Any]:
     """Return the maximum (h, w) over these numbers of squares and diamonds around each cell.
+
+    A thread takes some rows with those around that matter: what it works on stays in its cache.
+    """
+    least, pad, h = raster.min(), squares + diamonds + 1, len(raster)
+    rows = max(_BAND_CELLS // max(raster.shape[1], 1), 8 * pad)
+    out = np.empty_like(raster)
+
+    def fill(first: int) -> None:
+        last, low = min(first + rows, h), max(first - pad, 0)
+        part = _highest_of_rows(raster[low : last + pad], least, squares, diamonds)
+        out[first:last] = part[first - low : last - low]
+
+    list(map_blocks(fill, range(0, h, rows), threads))
+    return out
+
+
+def _highest_of_rows(raster: NDArray[Any], least: Any, squares: int, diamonds: int) -> NDArray[Any]:
+    """Return the maximum (h, w) around each cell of some rows; outside them is the `least` value.
 
     Each line of an octagon is a running maximum on the flat raster with a margin round it, by
     doubling: a maximum of 2m cells is that of two of m. Two diagonals and a cross of five cells
@@ -53,7 +76,7 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
     """
     pad = squares + diamonds + 1
     h, w = raster.shape
-    padded = np.full((h + 2 * pad, w + 2 * pad), raster.min(), raster.dtype)
+    padded = np.full((h + 2 * pad, w + 2 * pad), least, raster.dtype)
     padded[pad : pad + h, pad : pad + w] = raster
     values, stride = padded.ravel(), w + 2 * pad
     spare, n = np.empty_like(values), values.size
@@ -77,8 +100,7 @@ def highest_around(raster: NDArray[Any], squares: int, diamonds: int) -> NDArray
         out = np.maximum(out, shifted(1), out=spare[:size])
         for by in (-1, stride, -stride):
             np.maximum(out, shifted(by), out=out)
-    rows = np.lib.stride_tricks.as_strided(out, (h, w), (stride * out.itemsize, out.itemsize))
-    return np.ascontiguousarray(rows)
+    return np.lib.stride_tricks.as_strided(out, (h, w), (stride * out.itemsize, out.itemsize))
 
 
 @njit
@@ -125,7 +147,7 @@ def fill_holes(raster: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def openings_of(
-    raster: NDArray[np.float32], radii: Iterable[int]
+    raster: NDArray[np.float32], radii: Iterable[int], threads: int | None = 1
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield ascending radii in cells and openings (h, w) by octagons in meters."""
     # Erosion is the maximum of what is upended. The ceiling keeps windows from holes.
@@ -134,13 +156,23 @@ def openings_of(
     done = 0, 0
     for radius in sorted(radii):
         squares, diamonds = _steps(min(radius, sum(raster.shape)))
-        lowest_upended = highest_around(lowest_upended, squares - done[0], diamonds - done[1])
+        lowest_upended = highest_around(
+            lowest_upended, squares - done[0], diamonds - done[1], threads
+        )
         done = squares, diamonds
-        yield radius, highest_around(np.minimum(-lowest_upended, ceiling), squares, diamonds)
+        yield (
+            radius,
+            highest_around(np.minimum(-lowest_upended, ceiling), squares, diamonds, threads),
+        )
 
 
 def objects_of(
-    raster: NDArray[np.float32], cell: float, slope: float, window: int, keep: Collection[int] = ()
+    raster: NDArray[np.float32],
+    cell: float,
+    slope: float,
+    window: int,
+    keep: Collection[int] = (),
+    threads: int | None = 1,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], dict[int, NDArray[np.float32]]]:
     """Find the cells that an opening lowers by more than `slope` times its radius [P13, 2.2].
 
@@ -154,6 +186,7 @@ def objects_of(
         Radius of the largest window in cells; windows grow from 1 cell to it.
     keep : collection of int
         Radii in cells whose openings are returned.
+    threads : int, optional
 
     Returns
     -------
@@ -170,7 +203,7 @@ def objects_of(
     range_m = np.ptp(raster[measured]) if measured.any() else 0.0
     drops = {radius: np.float32(slope * radius * cell) for radius in growing_radii(window)}
     drops = {radius: drop for radius, drop in drops.items() if drop < range_m}
-    for radius, opened in openings_of(filled, {*drops, *keep}):
+    for radius, opened in openings_of(filled, {*drops, *keep}, threads):
         if radius in keep:
             openings[radius] = opened
         if radius in drops:

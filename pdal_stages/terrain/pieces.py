@@ -31,7 +31,7 @@ MAX_ALONE = 4000
 
 
 def patches(
-    column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int
+    column: NDArray[np.int64], row: NDArray[np.int64], reach: int, link: int, largest: int = 0
 ) -> Iterator[tuple[NDArray[np.int64] | slice, NDArray[np.bool_] | slice]]:
     """Yield the points of a piece with those around that matter, and which belong to the piece.
 
@@ -39,11 +39,13 @@ def patches(
 
     Every point belongs to one piece. Points more than `reach` cells away, along either axis, do not
     matter; nor do points that no chain of others connects with steps of at most `link` cells. One
-    piece, all points, where the whole is small enough.
+    piece, all points, where the whole has no more than the `largest` number of cells, or
+    `LARGEST_RASTER`.
     """
     window = GridWindow.enclosing(column, row)
+    largest = max(LARGEST_RASTER, largest)
     if window.width * window.height <= min(
-        LARGEST_RASTER, SMALL_RASTER + MAX_CELLS_PER_POINT * len(column)
+        largest, SMALL_RASTER + MAX_CELLS_PER_POINT * len(column)
     ):
         yield slice(None), slice(None)
         return
@@ -52,7 +54,7 @@ def patches(
     for group in groups:
         c, r = column[group], row[group]
         window = GridWindow.enclosing(c, r)
-        if window.width * window.height <= LARGEST_RASTER:
+        if window.width * window.height <= largest:
             yield group, slice(None)
             continue
         for members in group_by_key(cell_keys(c // SQUARE_SIDE, r // SQUARE_SIDE)):

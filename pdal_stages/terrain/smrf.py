@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.grid import GridWindow
-from ..base.threads import map_blocks
 from . import regain as regaining
 from . import wide_roofs
 from .cells import HOLE
@@ -24,7 +23,7 @@ from .low_outliers import find_low_outliers, outlier_reach
 from .minimum_grid import CellMeans, GroundPoints, ground_means, minimum_grid
 from .openings import FILL_RINGS, fill_holes, objects_of, openings_of
 from .steps import POINTS, Chain, FilterStep, Run
-from .surface import GroundRaster, cells_around, heights_above, surface
+from .surface import GroundRaster, cells_around, fit_surface, heights_above
 from .surface import reach as planes_reach
 from .wide_roofs import level_below_roofs
 
@@ -39,8 +38,6 @@ GROUND_POINTS = "ground_points"
 SURFACE = "surface"
 #: Cells around its own that a point's height is blended of.
 _BLEND = 1
-#: Points handed to a thread at a time.
-_SPAN = 1 << 17
 
 
 def cell_steps(options: FilterOptions) -> Chain:
@@ -65,9 +62,7 @@ def cell_steps(options: FilterOptions) -> Chain:
     return Chain(tuple(steps))
 
 
-def given_steps(
-    options: FilterOptions, ground: NDArray[np.bool_], threads: int | None = None
-) -> Chain:
+def given_steps(options: FilterOptions, ground: NDArray[np.bool_]) -> Chain:
     """Return the steps that measure heights above points (n,) that are ground."""
     steps = [
         FilterStep(GIVEN_GROUND, partial(_take, ground=ground, options=options), {POINTS: 0}, _mean)
@@ -75,13 +70,12 @@ def given_steps(
     if options.openings:
         run = partial(_open_requested, options=options)
         steps = [*_measured_cells(options), _openings_step(run, options.requested_radii), *steps]
-    return Chain(tuple(steps)) + surface_steps(options, GIVEN_GROUND, threads, given=True)
+    return Chain(tuple(steps)) + surface_steps(options, GIVEN_GROUND, given=True)
 
 
 def surface_steps(
     options: FilterOptions,
     ground: str,
-    threads: int | None = None,
     means: CellMeans | None = None,
     given: bool = False,
 ) -> Chain:
@@ -92,19 +86,18 @@ def surface_steps(
     options : FilterOptions
     ground : str
         The step that makes the cells.
-    threads : int, optional
     means : CellMeans, optional
         Means of the ground points of the cells, where they are known.
     given : bool
         Whether the cells are those of given ground, which the surface goes through.
     """
-    judge = partial(_judge, options=options, threads=threads, means=means, given=given)
-    near, far = options.near_levels, options.far_levels
-    reach = planes_reach(far)
+    judge = partial(_judge, options=options, means=means, given=given)
+    near, far = planes_reach(options.near_levels), planes_reach(options.far_levels)
+    means_reach = {} if given else {GROUND_POINTS: far}
     return Chain((
-        _surface_step(PROVISIONAL, near, {ground: planes_reach(near)}),
+        _surface_step(PROVISIONAL, options.near_levels, {ground: near}, options.threads),
         FilterStep(GROUND_POINTS, judge, {PROVISIONAL: _BLEND, POINTS: 0}, _mean, _BLEND),
-        _surface_step(SURFACE, far, {ground: reach, **({} if given else {GROUND_POINTS: reach})}),
+        _surface_step(SURFACE, options.far_levels, {ground: far, **means_reach}, options.threads),
     ))  # fmt: skip
 
 
@@ -148,7 +141,7 @@ def _measured_cells(options: FilterOptions) -> list[FilterStep]:
         return minimum_grid(points, raster.window, cell)
 
     def without_outliers(_: GroundPoints, raster: GroundRaster, window: GridWindow) -> GroundRaster:
-        outlier = find_low_outliers(raster.lowest, cell)
+        outlier = find_low_outliers(raster.lowest, cell, options.threads)
         heights = np.where(outlier, HOLE, raster.lowest)
         return replace(raster, lowest=heights, floor=heights, ground=raster.ground & ~outlier)
 
@@ -166,13 +159,15 @@ def _openings_step(run: Run, radii: list[int]) -> FilterStep:
     return FilterStep(OPENINGS, run, {LOW_OUTLIERS: reach}, _floor, radius + 2 * FILL_RINGS)
 
 
-def _surface_step(name: str, levels: int, reach: Mapping[str, int]) -> FilterStep:
+def _surface_step(
+    name: str, levels: int, reach: Mapping[str, int], threads: int | None
+) -> FilterStep:
     """Return the step that fits a surface through ground where points are."""
 
     def fit(points: GroundPoints, raster: GroundRaster, window: GridWindow) -> GroundRaster:
         near = window.padded(_BLEND).intersect(raster.window)
         needed = cells_around(raster.window, near, points.column, points.row)
-        return replace(raster, planes=surface(raster, levels, needed, raster.planes))
+        return replace(raster, surface=fit_surface(raster, levels, needed, threads))
 
     return FilterStep(name, fit, reach, _height, planes_reach(levels))
 
@@ -181,8 +176,9 @@ def _open(
     points: GroundPoints, raster: GroundRaster, window: GridWindow, options: FilterOptions
 ) -> GroundRaster:
     """Find the cells that openings with growing windows lower: objects."""
+    radii = options.radius, options.requested_radii
     objects, floor, opened = objects_of(
-        raster.lowest, options.cell, options.slope, options.radius, options.requested_radii
+        raster.lowest, options.cell, options.slope, *radii, options.threads
     )
     return replace(raster, ground=raster.ground & ~objects, floor=floor, opened=opened)
 
@@ -191,7 +187,8 @@ def _open_requested(
     points: GroundPoints, raster: GroundRaster, window: GridWindow, options: FilterOptions
 ) -> GroundRaster:
     """Make the openings above which heights are requested."""
-    opened = openings_of(fill_holes(raster.lowest), {*options.requested_radii})
+    radii = {*options.requested_radii}
+    opened = openings_of(fill_holes(raster.lowest), radii, options.threads)
     return replace(raster, opened=dict(opened))
 
 
@@ -235,32 +232,18 @@ def _judge(
     raster: GroundRaster,
     window: GridWindow,
     options: FilterOptions,
-    threads: int | None,
     means: CellMeans | None,
     given: bool,
 ) -> GroundRaster:
     """Tell which points are ground, by the provisional surface; take their means for cells."""
-    height, gradient = heights_of(points, raster, options.cell, threads)
-    is_ground = options.is_ground(points.use, height, gradient)
+    assert raster.surface is not None
+    x, y, z, _, _, row = points
+    above = heights_above(x, y, z, row, raster.surface, options.cell, options.threads)
+    is_ground = options.is_ground(points.use, *above)
     if given:
-        return replace(raster, is_ground=is_ground)
+        return replace(raster, is_ground=is_ground, surface=None)
     held, place = means or ground_means([(points, is_ground)], options.cell, raster.window)
-    return replace(raster, ground=held, place=place, is_ground=is_ground)
-
-
-def heights_of(
-    points: GroundPoints, raster: GroundRaster, cell: float, threads: int | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the heights of points (n,) above the surface of a raster, and its gradients there."""
-    height, gradient = np.empty((2, len(points.x)))
-
-    def measure(s: slice) -> None:
-        x, y, z = (axis[s] for axis in points[:3])
-        heights_above(x, y, z, cell, raster.window[:2], raster.planes, height[s], gradient[s])
-
-    spans = [slice(start, start + _SPAN) for start in range(0, len(height), _SPAN)]
-    list(map_blocks(measure, spans, threads))
-    return height, gradient
+    return replace(raster, ground=held, place=place, is_ground=is_ground, surface=None)
 
 
 # ---- what they show ------------------------------------------------------------------------------
@@ -288,5 +271,6 @@ def _mean(raster: GroundRaster) -> NDArray[np.float64]:
 
 def _height(raster: GroundRaster) -> NDArray[np.float64]:
     """Return the heights (h, w) of the surface in the middle of cells; NaN away from points."""
-    assert raster.planes is not None
-    return raster.planes[..., 0]
+    assert raster.surface is not None
+    rows, columns = raster.window.slices_in(raster.surface.window)
+    return raster.surface.planes(rows)[:, columns, 0]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..base.grid import GridWindow
 from ..base.jit import device, njit
+from ..base.threads import map_blocks
 from .cells import HOLE
 from .openings import highest_around
 
@@ -28,6 +29,54 @@ _STIFFNESS = 0.02
 _HOLD = 0.1
 #: Weight of the blocks beside one, of 1, in its fit; of those at its corners the square.
 _BESIDE = 0.5
+#: Rows that a thread takes at a time; results do not depend on it.
+_BAND = 64
+
+
+@dataclass(frozen=True)
+class GroundSurface:
+    """A surface through the ground of a raster: of its planes only those of blocks are held.
+
+    The planes of cells are computed for some rows at a time, as all of them would take more memory
+    than all else.
+    """
+
+    window: GridWindow  #: which cells
+    blocks: NDArray[np.float64]  #: (h / 2, w / 2, 3) planes of blocks of 2 x 2 cells
+    corner: tuple[int, int]  #: first column and row of these blocks
+    needed: NDArray[np.bool_]  #: (h, w) cells whose planes points blend
+    ground: NDArray[np.bool_]  #: (h, w), as of :class:`GroundRaster`
+    place: NDArray[np.float64]  #: (h, w, 3), likewise
+
+    def planes(self, rows: slice) -> NDArray[np.float64]:
+        """Return the planes (n, w, 3) of some rows: height and gradient per cell.
+
+        They are NaN where they are not needed, and beyond the reach of all measured cells.
+        """
+        needed, place = self.needed[rows], self.place[rows]
+        planes = np.full((*needed.shape, 3), np.nan)
+        left, bottom = self.window[:2]
+        _finer(self.blocks, *self.corner, 1.0, left, bottom + rows.start, needed, planes)
+        # Those of ground cells hold their cell's ground.
+        j, i = np.nonzero(self.ground[rows] & needed)
+        rise = place[j, i, :2] * planes[j, i, 1:]
+        planes[j, i, 0] = place[j, i, 2] - rise[:, 0] - rise[:, 1]
+        return planes
+
+
+@dataclass(frozen=True)
+class LevelSurface:
+    """A raster of heights that is a surface."""
+
+    window: GridWindow  #: which cells
+    heights: NDArray[np.float32]  #: (h, w), meters; not finite where there is none
+
+    def planes(self, rows: slice) -> NDArray[np.float64]:
+        """Return the level planes (n, w, 3) of some rows, NaN where there is no height."""
+        heights = self.heights[rows]
+        planes = np.zeros((*heights.shape, 3))
+        planes[..., 0] = np.where(np.isfinite(heights), heights, np.nan)
+        return planes
 
 
 @dataclass(frozen=True)
@@ -42,8 +91,7 @@ class GroundRaster:
     ground: NDArray[np.bool_]  #: (h, w)
     floor: NDArray[np.float32]  #: (h, w) what lies below objects
     opened: Mapping[int, NDArray[np.float32]]  #: (h, w) openings by their radius
-    #: (h, w, 3) of a surface: see :func:`surface`
-    planes: NDArray[np.float64] | None = None
+    surface: GroundSurface | LevelSurface | None = None  #: through the ground, once it is fitted
     is_ground: NDArray[np.bool_] | None = (
         None  #: (n,) which points are ground, once they are judged
     )
@@ -59,15 +107,13 @@ class GroundRaster:
             return self
         part = window.slices_in(self.window)
         rasters = {name: getattr(self, name) for name in _RASTERS}
-        cells = {
-            name: values[part].copy() for name, values in rasters.items() if values is not None
-        }
+        cells = {name: values[part].copy() for name, values in rasters.items()}
         opened = {radius: values[part].copy() for radius, values in self.opened.items()}
         return replace(self, window=window, opened=opened, **cells)
 
 
 #: Fields of a :class:`GroundRaster` that have a value for each cell.
-_RASTERS = ("lowest", "place", "ground", "floor", "planes")
+_RASTERS = ("lowest", "place", "ground", "floor")
 
 
 def reach(levels: int) -> int:
@@ -217,12 +263,11 @@ def _finer(parents, parents_left, parents_bottom, size, left, bottom, needed, pl
 
 
 @njit
-def _fit(moments, size, needed, planes):
+def _fit(moments, size, needed, planes, first, last):
     """Correct the needed planes, as the coarser level has them, by the ground of 3 x 3 blocks."""
-    h, w = moments.shape[:2]
     sums = np.empty(9)
-    for j in range(h):
-        for i in range(w):
+    for j in range(first, last):
+        for i in range(moments.shape[1]):
             if not needed[j, i]:
                 continue
             _sum_around(moments, j, i, size, sums)
@@ -248,7 +293,7 @@ def _fit(moments, size, needed, planes):
 
 
 def planes_of_blocks(
-    raster: GroundRaster, levels: int, needed: NDArray[np.bool_]
+    raster: GroundRaster, levels: int, needed: NDArray[np.bool_], threads: int | None = 1
 ) -> tuple[NDArray[np.float64], tuple[int, int]]:
     """Fit planes of blocks of 2 x 2 cells through the ground of a raster.
 
@@ -282,51 +327,106 @@ def planes_of_blocks(
     _coarsest(sums, 2.0**levels, wanted[levels], planes)
     for level in range(levels, 0, -1):
         sums = moments.pop()
-        if level < levels:
-            coarser, planes = planes, np.empty((*sums.shape[:2], 3))
-            _finer(coarser, *spans[level + 1], 2.0**level, *spans[level], wanted[level], planes)
-        _fit(sums, 2.0**level, wanted[level], planes)
+        coarser, planes = planes, planes if level == levels else np.empty((*sums.shape[:2], 3))
+        parents = None if level == levels else (coarser, *spans[level + 1])
+        _fit_level(sums, 2.0**level, wanted[level], spans[level], parents, planes, threads)
     return planes, spans[1]
 
 
-def surface(
-    raster: GroundRaster,
-    levels: int,
+def _fit_level(
+    sums: NDArray[np.float64],
+    size: float,
     needed: NDArray[np.bool_],
-    planes: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Fit planes at the centers of the `needed` cells (h, w): height and gradient per cell.
+    corner: tuple[int, int],
+    parents: tuple[NDArray[np.float64], int, int] | None,
+    planes: NDArray[np.float64],
+    threads: int | None,
+) -> None:
+    """Compute the needed planes of the blocks of one level, from those of the next coarser one.
 
-    The result is (h, w, 3), NaN beyond the reach of all measured cells.
-
-    There are `levels` coarser levels, at least 1. Planes of an earlier call for the same cells are
-    overwritten where they are given.
+    A thread takes some rows. `parents` are the coarser planes, and their first column and row; None
+    where the planes have been evaluated.
     """
-    ground, place = raster.ground, raster.place
-    blocks, corner = planes_of_blocks(raster, levels, needed)
-    if planes is None:
-        planes = np.full((*ground.shape, 3), np.nan)
-    _finer(blocks, *corner, 1.0, *raster.window[:2], needed, planes)
-    # Those of ground cells hold their cell's ground.
-    j, i = np.nonzero(ground & needed)
-    rise = place[j, i, :2] * planes[j, i, 1:]
-    planes[j, i, 0] = place[j, i, 2] - rise[:, 0] - rise[:, 1]
+
+    def fit(first: int) -> None:
+        rows = slice(first, min(first + _BAND, len(needed)))
+        if parents is not None:
+            left, bottom = corner[0], corner[1] + first
+            _finer(*parents, size, left, bottom, needed[rows], planes[rows])
+        _fit(sums, size, needed, planes, rows.start, rows.stop)
+
+    list(map_blocks(fit, range(0, len(needed), _BAND), threads))
+
+
+def fit_surface(
+    raster: GroundRaster, levels: int, needed: NDArray[np.bool_], threads: int | None
+) -> GroundSurface:
+    """Fit a surface through the ground of a raster for the `needed` cells (h, w).
+
+    There are `levels` levels of blocks, at least 1.
+    """
+    blocks, corner = planes_of_blocks(raster, levels, needed, threads)
+    return GroundSurface(raster.window, blocks, corner, needed, raster.ground, raster.place)
+
+
+@njit
+def planes_at(cells, width, left, bottom, blocks, corner):
+    """Return the planes (n, 3) at the centers of cells (n,) that are no ground.
+
+    Cells are numbered row by row in a raster of some `width`, whose first column and row are `left`
+    and `bottom`; `blocks` and `corner` are those of :func:`planes_of_blocks`.
+    """
+    planes = np.empty((len(cells), 3))
+    for k in range(len(cells)):
+        j, i = cells[k] // width, cells[k] % width
+        planes[k, 0], planes[k, 1], planes[k, 2] = from_parents(
+            blocks, corner[0], corner[1], i + left, j + bottom, 1.0
+        )
     return planes
 
 
 @njit
-def heights_above(x, y, z, cell, corner, planes, height, gradient):
-    """Compute the height of points (n,) above the surface, and its slope there.
-
-    `corner` is the first column and row of the planes (h, w, 3).
-    """
+def _heights_above(points, x, y, z, cell, corner, planes, out):
+    """Compute the height of some points (m,) of all (n,) above planes (h, w, 3), and the slope."""
     left, bottom = corner
-    for p in range(len(x)):
+    for p in points:
         u, v = x[p] / cell - 0.5, y[p] / cell - 0.5
         i, j = np.floor(u), np.floor(v)
         level, across, along = blend(planes, int(i) - left, int(j) - bottom, u - i, v - j, 1.0)
-        height[p] = z[p] - level
-        gradient[p] = np.sqrt(across * across + along * along) / cell
+        out[0, p] = z[p] - level
+        out[1, p] = np.sqrt(across * across + along * along) / cell
+
+
+def heights_above(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    row: NDArray[np.int64],
+    surface: GroundSurface | LevelSurface,
+    cell: float,
+    threads: int | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the heights of points (n,) above a surface, and its gradients there; NaN outside.
+
+    `row` are the rows of the points' cells, whose side is `cell` meters. A thread takes the points
+    of some rows.
+    """
+    out = np.empty((2, len(x)))
+    left, bottom, _, count = surface.window
+    bands = -(-count // _BAND)
+    band = np.clip((row - bottom) // _BAND, 0, max(bands - 1, 0)).astype(np.uint16)
+    order = np.argsort(band, kind="stable")
+    ends = np.cumsum(np.bincount(band, minlength=bands))
+
+    def measure(number: int) -> None:
+        members = order[(ends[number - 1] if number else 0) : ends[number]]
+        if len(members):  # points blend the four cells around them
+            rows = slice(max(number * _BAND - 1, 0), min((number + 1) * _BAND + 1, count))
+            corner, planes = (left, bottom + rows.start), surface.planes(rows)
+            _heights_above(members, x, y, z, cell, corner, planes, out)
+
+    list(map_blocks(measure, range(bands), threads))
+    return out[0], out[1]
 
 
 def cells_around(
