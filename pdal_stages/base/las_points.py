@@ -421,6 +421,16 @@ class LasColumns(Mapping[str, NDArray]):
         return name in self.layout.names
 
 
+def columns_of_files(paths: Sequence[str]) -> RecordColumns:
+    """Return the dimensions of all points of files, one after the other."""
+    parts: list[tuple[Layout, NDArray]] = []
+    for path in paths:
+        layout = Layout.of(path)
+        records = [np.empty(0, layout.dtype), *read_records(path, layout)]
+        parts.append((layout, np.concatenate(records)))
+    return RecordColumns(parts)
+
+
 @dataclass(eq=False)
 class SomeRows(Mapping[str, NDArray]):
     """Dimensions of some points, each taken when it is asked for."""

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from ..base.errors import DimensionError, StageError, suggest
 from ..base.files import check_outputs
 from ..base.las import header_there
+from ..base.las_check import check_readable
+from ..base.las_points import LasColumns, Layout
 from ..base.messages import Report
 from ..base.progress import Progress
 from ..base.units import METERS_PER_DEGREE, is_geographic
@@ -19,11 +21,12 @@ from ..stages.accuracy import AccuracyStage
 from ..stages.points import Points
 from ..stages.registry import stage_from
 from .expansion import stage_files
-from .inputs_outputs import input_files
+from .inputs_outputs import input_files, is_las
 from .json_source import Override, apply_overrides
 from .pdal import reader_of
 from .run import Pipeline
 from .runtime import points_of_views
+from .spatial_reference import text_of
 
 #: What to do where the true classes are not known.
 WHAT_IS_TRUE = (
@@ -118,6 +121,10 @@ def paired(sources: Sequence[str], references: Sequence[str]) -> list[tuple[str,
 
 def _read(source: str) -> Points:
     """Return all points of a file."""
+    if is_las(source):
+        check_readable(source)
+        wkt, _ = text_of({"type": "readers.las", "filename": source})
+        return Points(LasColumns(source, Layout.of(source)), wkt=wkt)
     pipeline = Pipeline([reader_of(source, "input")])
     pipeline.execute()
     return points_of_views(pipeline.arrays, pipeline.metadata)

@@ -17,7 +17,7 @@ from typing import Any
 
 from ..base.errors import StageError
 from ..base.version import __version__
-from ..pipeline import expansion, runtime
+from ..pipeline import expansion, pdal_facts, runtime
 from ..stages.base import Stage, StageContext
 from ..stages.registry import place, stage_from, stage_type, stage_types
 from . import declarations
@@ -74,6 +74,8 @@ def _make_stage(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
     for name, value in question["options"]:  # lists come as several values
         options[name] = f"{options[name]},{value}" if name in options else value
     before = _stages(question["pipeline"])[:-1]
+    if question["step"] == "prepare":
+        pdal_facts.check_inputs([stage for stage in before if "type" in stage])
     named = {"type": kind.type, "tag": question.get("tag")}
     stage = stage_from({**kind.from_pipeline(options, before), **options, **named})
     upstream = [(earlier, _creates(earlier)) for earlier in before]

@@ -14,6 +14,7 @@ from ..base import las
 from ..base.distinct import DistinctPoints
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs
+from ..base.las_points import columns_of_files
 from ..base.memory import free_memory
 from ..base.messages import Report
 from ..classifier.model import Model
@@ -25,7 +26,7 @@ from ..pipeline.json_source import Override, overridden
 from ..pipeline.pdal import reader_of
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import points_of_views
-from ..pipeline.spatial_reference import check_readers
+from ..pipeline.spatial_reference import check_readers, text_of
 from ..stages.points import Points
 from ..stages.preprocessing import preparation_of
 from ..stages.registry import stage_from
@@ -138,10 +139,16 @@ class TrainTask:
         messages = check_readers(readers)
         stages = [*map(dict, heights)] or [{"type": "filters.merge"}]  # one end of all readers
         pipeline = Pipeline([*readers, *stages], self._other_overrides)
-        pipeline.execute()
-        if not any(map(len, pipeline.arrays)):
+        if pipeline.is_read_here:
+            pipeline.check_inputs(pdal=False)
+            columns = columns_of_files(files)
+            wkt = next(filter(None, (text_of(reader)[0] for reader in readers)), "")
+            points = self.stage.points(pipeline.run_here(columns, wkt), wkt=wkt)
+        else:
+            pipeline.execute()
+            points = points_of_views(pipeline.arrays, pipeline.metadata, self.stage.points)
+        if not points.count:
             raise StageError("there are no points to train on", where=", ".join(files[:3]))
-        points = points_of_views(pipeline.arrays, pipeline.metadata, self.stage.points)
         points.report.warnings += [
             *messages,
             *(f"PDAL says: {line}" for line in pipeline.log_lines[:10]),

@@ -207,3 +207,17 @@ def test_the_file_source_id(command, tmp_path, write_las):
         command.runs(["pipeline", job(tmp_path, *(ids[n] for n in names), HAG, las(out))])
         if pdal_env.version() < (2, 4, 0) or names != "a":
             assert laspy.read(out).header.file_source_id == right, names
+
+
+def test_other_commands_take_names_as_they_are(command, tmp_path):
+    """`accuracy`, `review` and `train` read the file that is named, with what PDAL would misread."""
+    for name, seed in (("t[1].las", 1), ("t1.las", 2)):
+        file = LasFile(2, 1, seed=seed, flags=False, count=600, text="Géomètre".encode("latin-1"))
+        (tmp_path / name).write_bytes(file.build())
+    out = tmp_path / "out"
+    command.runs(["classify", tmp_path / "t[1].las", f"{out}/"])
+    named = out / "t[1].las"
+    assert "100.00 %" in command.runs(["accuracy", named, "--reference", named]).out
+    command.refused(["accuracy", named, "--reference", tmp_path / "t1.las"], "the same points")
+    pytest.importorskip("pyogrio")
+    command.runs(["review", named, tmp_path / "review.gpkg"])
