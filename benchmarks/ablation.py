@@ -1,4 +1,4 @@
-"""What each rule and parameter of ground, noise, decks and wires does to real labeled clouds.
+"""What each rule and parameter of ground, noise and decks does to real labeled clouds.
 
     python benchmarks/ablation.py --data FOLDER [--of ground noise ...] [--only ROW ...] [--json
     FILE]
@@ -13,7 +13,7 @@ twelve surveys clips of 160 m
   not scored. Six with roofs are stretched to three times their width, heights stay.
 - noise: 1 % of points put into each survey as `noise.py` does, and the published noise of surveys
 that have it.
-- decks, wires: points of that class missed, and others taken for it, on all surveys.
+- decks: points of that class missed, and others taken for it, on all surveys.
 Unclassified points are not
   scored, as cars and poles are among them.
 
@@ -44,7 +44,7 @@ from clouds import mislabeled, published
 from noise import injected
 from surveys import GROUND, SURVEYS, VEGETATION
 
-from pdal_stages.structures import decks, wires
+from pdal_stages.structures import decks
 from pdal_stages.terrain import (
     detached,
     detached_noise,
@@ -65,7 +65,7 @@ class Cloud(NamedTuple):
     kind: str  #: the column of the ground's table
     xyz: np.ndarray  #: (n, 3) meters
     truth: np.ndarray  #: (n,) 2 ground, 5 and 6 objects, 0 not scored
-    codes: np.ndarray  #: (n,) as published; 17 decks, 14 wires, 7 and 18 noise
+    codes: np.ndarray  #: (n,) as published; 17 decks, 7 and 18 noise
 
     def take(self, rows: np.ndarray) -> Cloud:
         return self._replace(xyz=self.xyz[rows], truth=self.truth[rows], codes=self.codes[rows])
@@ -202,20 +202,17 @@ def noise_error(cloud: Cloud) -> float:
     return percent(marked != np.isin(cloud.codes, NOISE))
 
 
-class Heights(NamedTuple):
-    """A cloud without noise, and what detectors of structures read."""
+class Filtered(NamedTuple):
+    """A cloud without noise, and its ground."""
 
     cloud: Cloud
-    height: np.ndarray
     ground: np.ndarray
 
     @classmethod
-    def above(cls, cloud: Cloud) -> Heights:
-        """Return the heights that the ground filter finds."""
+    def of(cls, cloud: Cloud) -> Filtered:
+        """Return the ground that the ground filter finds."""
         cloud = cloud.take(~np.isin(cloud.codes, NOISE))
-        values = filtered_ground(cloud.xyz)
-        height, ground = values["HeightAboveGround"], values["Ground"] > 0
-        return cls(cloud, height, ground)
+        return cls(cloud, filtered_ground(cloud.xyz)["Ground"] > 0)
 
     def error(self, detected: np.ndarray, code: int) -> float:
         """Return the error of a class; unclassified points are not scored."""
@@ -223,16 +220,10 @@ class Heights(NamedTuple):
         return percent(detected[scored] != (self.cloud.codes[scored] == code))
 
 
-def deck_error(heights: Heights) -> float:
+def deck_error(filtered: Filtered) -> float:
     """Return the error of bridge decks."""
-    xyz, use = heights.cloud.xyz, np.ones(len(heights.height), bool)
-    return heights.error(decks.find_decks(*xyz.T.copy(), use, heights.ground, decks.RULES), 17)
-
-
-def wire_error(heights: Heights) -> float:
-    """Return the error of wires."""
-    xyz, use = heights.cloud.xyz, np.ones(len(heights.height), bool)
-    return heights.error(wires.find_wires(xyz, heights.height, use, wires.RULES), 14)
+    xyz, use = filtered.cloud.xyz, np.ones(len(filtered.ground), bool)
+    return filtered.error(decks.find_decks(*xyz.T.copy(), use, filtered.ground, decks.RULES), 17)
 
 
 def no_outliers(raster: np.ndarray, *_: Any) -> np.ndarray:
@@ -327,15 +318,6 @@ ROWS: dict[str, dict[str, Row]] = {
         "drops may be gentle": rule(decks, min_wall_slope=0.0),
         "layers need not be solid": rule(decks, min_neighbors=0),
     },
-    "wires": {
-        "as it is": Row(),
-        "24 neighbors": rule(wires, max_neighbors=24),
-        "any neighbors": rule(wires, max_neighbors=10**6),
-        "the air around may be full": rule(wires, max_around_ratio=1e9),
-        "lines may hide what is below": rule(wires, min_clear_share=0.0),
-        "any length": rule(wires, min_length_m=1.0),
-        "no gaps": rule(wires, hop_m=1.0),
-    },
 }
 
 
@@ -348,8 +330,8 @@ def errors_of(what: str, every: dict[str, Cloud], only: list[str]) -> dict[str, 
         inputs = {name: with_noise(cloud) for name, cloud in every.items()}
         score = noise_error
     else:
-        inputs = {name: Heights.above(cloud) for name, cloud in every.items()}
-        score = {"decks": deck_error, "wires": wire_error}[what]
+        inputs = {name: Filtered.of(cloud) for name, cloud in every.items()}
+        score = deck_error
     errors: dict[str, dict[str, float]] = {}
     for words, row in ROWS[what].items():
         if only and words not in (*only, "as it is"):

@@ -1,8 +1,8 @@
-"""Bridge decks and wires: how many of their points are found, and how many others are taken for them.
+"""Bridge decks: how many of their points are found, and how many others are taken for them.
 
 python benchmarks/bridges.py --data FOLDER
 
-Decks of scenes (tests/bridge_scenes.py; 8 points/m2, none on water) and of the labeled clouds; wires of those clouds.
+Decks of scenes (tests/bridge_scenes.py; 8 points/m2, none on water) and of the labeled clouds.
 Cars, lamps and what was never labeled count neither way. `false` is the share of all points that
 are wrongly taken; seconds are of one process.
 """
@@ -18,7 +18,6 @@ import laspy
 import numpy as np
 
 from pdal_stages.structures.decks import find_decks
-from pdal_stages.structures.wires import find_wires
 from pdal_stages.terrain.heights import filtered_ground
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -61,15 +60,6 @@ def decks(
     row(name, "deck", decks, true, either, time.process_time() - begin)
 
 
-def wires(
-    name: str, xyz: np.ndarray, use: np.ndarray, true: np.ndarray, either: np.ndarray
-) -> None:
-    height = filtered_ground(xyz, mask=use)["HeightAboveGround"]
-    begin = time.process_time()
-    wire = find_wires(xyz, height, use)
-    row(name, "wire", wire, true, either, time.process_time() - begin)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the labeled clouds")
@@ -87,7 +77,6 @@ def main() -> None:
         if "powerline" in name:
             use &= codes != 26
         decks(name, las.xyz, use, bridge, codes == 1)
-        wires(name, las.xyz, use, codes == 14, codes == 15)
 
 
 if __name__ == "__main__":

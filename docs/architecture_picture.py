@@ -26,7 +26,7 @@ COLUMNS = (
         (
             ("Reader", "", "PDAL"),
             ("Hand the points to the stage,", "in meters, class codes without flags", "pipeline/"),
-            ("Heights, ground, noise;", "decks, wires", "terrain/ structures/"),
+            ("Heights, ground, noise;", "decks", "terrain/ structures/"),
             ("Features of many neighborhoods,", "block by block", "features/"),
         ),
     ),

@@ -20,6 +20,9 @@ def test_counts_and_duplicates(random_cloud):
     assert samples.counts(1) == {"available": 30, "samples": 30, "duplicates": 70}
     small = samples.weight[samples.label == 1]
     assert small.sum() == 100 and set(small.tolist()) == {3, 4}
+    rare = draw_samples([(xyz, label)], 2, 100, 7, fill_up=False)
+    assert rare.counts(0) == samples.counts(0)
+    assert rare.counts(1) == {"available": 30, "samples": 30, "duplicates": 0}
     assert (label[samples.row] == samples.label).all()
     assert len(set(zip(samples.cloud.tolist(), samples.row.tolist(), strict=True))) == len(samples)
 

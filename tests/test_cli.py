@@ -110,7 +110,11 @@ def test_classify_imports_no_extras(cloud, tmp_path):
 @pytest.mark.parametrize(
     ("words", "inputs", "output"),
     [
-        ("classify a.laz --tile 500 b.laz --wires c.laz out/", ["a.laz", "b.laz", "c.laz"], "out/"),
+        (
+            "classify a.laz --tile 500 b.laz --bridges c.laz out/",
+            ["a.laz", "b.laz", "c.laz"],
+            "out/",
+        ),
         ("objects a.laz b.laz --cell 1 o.gpkg", ["a.laz", "b.laz"], "o.gpkg"),
         ("review --workers 2 a.laz b.laz --no-progress o.gpkg", ["a.laz", "b.laz"], "o.gpkg"),
         ("train a.laz --model m.model b.laz", ["a.laz", "b.laz"], None),

@@ -110,7 +110,7 @@ def test_after_warmup_a_job_compiles_nothing(ready_town, tmp_path):
         "    made = [kernel._dispatcher for kernel in _functions if kernel._dispatcher]\n"
         "    return {(one.__name__, str(types)) for one in made for types in one.signatures}\n"
         "main(['warmup'])\nbefore = compiled()\n"
-        "assert main(['classify', '--wires', *argv[1:3]]) == main(['objects', *argv[2:]]) == 0\n"
+        "assert main(['classify', *argv[1:3]]) == main(['objects', *argv[2:]]) == 0\n"
         "assert compiled() == before, compiled() - before"
     )
     files = [ready_town, tmp_path / "c.laz", tmp_path / "o.gpkg"]

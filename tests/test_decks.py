@@ -136,13 +136,13 @@ def test_bridges_leave_ground_and_buildings():
     ground = filtered_ground(xyz, threads=1)["Ground"]
     deck = np.flatnonzero(detect(xyz, ground=ground > 0))
     given_codes = np.full(len(xyz), 2, np.uint8)
-    given_codes[deck[:5]] = 6, 5, 12, 18, 1
+    given_codes[deck[:7]] = 6, 5, 12, 18, 1, 14, 15
     arrays = dict(zip("XYZ", xyz.T.copy(), strict=True))
     arrays |= {"Classification": given_codes, "Ground": ground}
     stage = Bridges({"code": 20})
     points = stage.points(arrays)
     out = stage.run(points, WHOLE_CLOUD)["Classification"]
-    assert out[deck[:5]].tolist() == [20, 5, 12, 18, 20]
+    assert out[deck[:7]].tolist() == [20, 5, 12, 18, 20, 14, 15]
     assert (out == 20).sum() == points.report.figures["decks"] > 0.9 * len(deck)
     assert {"1", "2", "6"} >= set(points.report.figures["left"])
 

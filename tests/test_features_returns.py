@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.classifier.input_dimensions import (
-    add_return_features,
+    add_surroundings,
     optional_dimensions,
     required_dimensions,
     take_dimensions,
@@ -77,7 +77,7 @@ def test_without_return_numbers_all_is_zero():
     for dimensions in ({}, {name: np.zeros(50, np.uint8) for name in return_features.SOURCES}):
         fed = take_dimensions(
             return_features.NAMES,
-            add_return_features(return_features.NAMES, xyz, dimensions),
+            add_surroundings(return_features.NAMES, xyz, dimensions),
             50,
             np.arange(0, 50, 7),
         )

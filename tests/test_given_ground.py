@@ -102,7 +102,7 @@ def classified(path, out, *words):
 @pytest.mark.pdal
 def test_classify_keeps_the_ground_that_is_given(edited, tmp_path, capsys):
     known = np.asarray(laspy.read(edited).classification) == 2
-    xyz, codes, las = classified(edited, tmp_path / "out.laz", "--wires")
+    xyz, codes, las = classified(edited, tmp_path / "out.laz")
     assert (codes[known] == 2).all()
     assert not (codes[far_from(xyz, known) & ~known] == 2).any()
     assert (codes[~known] == 2).sum() > 500  # the strip that was not marked

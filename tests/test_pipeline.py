@@ -12,7 +12,7 @@ from processes import printed
 
 import pdal_stages as ps
 from pdal_stages import run_tiled
-from pdal_stages.base.errors import DimensionError, OptionError
+from pdal_stages.base.errors import DimensionError, OptionError, PipelineError
 from pdal_stages.cli import main
 from pdal_stages.pipeline import pdal as pdal_env
 from pdal_stages.pipeline.expansion import fuse_scripts
@@ -109,6 +109,14 @@ def test_door_3_filters_python_by_hand(cloud, pdal_module):
     assert pipeline.arrays[0]["HeightAboveGround"].max() > 5
 
 
+def test_a_stage_of_earlier_releases_names_the_cure(cloud):
+    cure = "filters.wires' is no longer in.*class 14"
+    with pytest.raises(PipelineError, match=cure):
+        ps.Pipeline([str(cloud), {"type": "filters.wires"}])
+    with pytest.raises(AttributeError, match=cure):
+        ps.Filter.wires()
+
+
 # ---- several stages in one filter ------------------------------------------------------------------------
 
 
@@ -117,7 +125,7 @@ def test_stages_that_follow_one_another_are_one_filter(cloud, model):
     heights = {"type": "filters.hag_morphological", "ground": True, "terrain_slope": True}
     classifier = {"type": "filters.modelclassifier", "model": str(model)}
     ours = [{"type": "filters.detachednoise"}, heights, classifier, {"type": "filters.bridges"}]
-    stages = [str(cloud), *ours, {"type": "filters.wires"}]
+    stages = [str(cloud), *ours, {"type": "filters.hag_minima"}]
     alone = [stages[0], *({**stage, "tag": f"t{n}"} for n, stage in enumerate(stages[1:]))]
     pipelines = [ps.Pipeline(each) for each in (stages, alone)]
     plain, tagged = (fuse_scripts(pipeline.expanded.stages) for pipeline in pipelines)

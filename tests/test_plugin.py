@@ -121,7 +121,6 @@ EVERY = [
         "neighborhoods": ["c1", "kopt(10,30)"],
         "feature_set": "covariance",
     },
-    {"type": "filters.wires", "code": 13},
     {"type": "filters.bridges", "code": 18},
     {"type": "filters.objects", "building_height": 3},
     {"type": "filters.accuracy", "reference": "Classification", "print": False},

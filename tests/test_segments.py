@@ -80,10 +80,10 @@ def test_a_tile_with_its_halo_has_the_same_bits(seed):
 
 def test_what_segments_need_is_checked():
     context = Context(("own", "segments6", "box1"))
-    context.check_segments((2, 5, 6), ("HeightAboveGround",))
+    context.check_codes((2, 5, 6), ("HeightAboveGround",))
     for codes, dimensions in (((2, 5), ("HeightAboveGround",)), ((2, 6), ("Intensity",))):
         with pytest.raises(ModelError, match="segments6"):
-            context.check_segments(codes, dimensions)
+            context.check_codes(codes, dimensions)
 
 
 def test_columns_lie_where_their_names_say():

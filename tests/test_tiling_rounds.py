@@ -108,8 +108,8 @@ def columns(path: Path) -> list[np.ndarray]:
 
 
 def test_an_interrupted_run_of_the_shipped_model_goes_on(tmp_path, capsys):
-    """With wires and bridges, which look farther than a tile is wide."""
-    words = ["classify", str(CITY), "--wires", "--bridges", "--no-progress"]
+    """With bridges, which look farther than a tile is wide."""
+    words = ["classify", str(CITY), "--bridges", "--no-progress"]
     assert main([*words, str(tmp_path / "whole.laz")]) == 0
     out = tmp_path / "out"
     out.mkdir()

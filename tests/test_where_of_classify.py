@@ -6,7 +6,6 @@ import laspy
 import numpy as np
 import pytest
 from bridge_scenes import SCENES, scan
-from test_wires import scene
 
 from pdal_stages.stages.points import SELECTED, Points
 
@@ -32,24 +31,24 @@ def classes(path):
 
 
 @pytest.mark.parametrize("tiles", [(), TILES])
-def test_wires_of_points_that_the_model_gives_another_class(tmp_path, run, write_las, tiles):
+def test_decks_of_points_that_the_model_gives_another_class(tmp_path, run, write_las, tiles):
     """LAS 1.2, where some points have flags and some have a class that --where leaves out."""
-    xyz, codes = scene(0, 3.0)
+    xyz, codes = scan(SCENES["overpass"](), 4.0)
     rng = np.random.default_rng(0)
     flags = (rng.random(len(xyz)) < 0.2).astype(np.uint8)
     source = write(write_las, tmp_path / "in.las", xyz, 1, Synthetic=flags, KeyPoint=flags[::-1])
-    words = ("classify", source, tmp_path / "out.las", "--wires", *tiles)
+    words = ("classify", source, tmp_path / "out.las", "--bridges", *tiles)
     assert run(*words)[0] == 0
     every = classes(tmp_path / "out.las")
     code, output, err = run(*words, *WHERE)
     assert code == 0, err
     codes_values = classes(tmp_path / "out.las")
     assert np.array_equal(codes_values, every) and codes_values[0] == 7
-    assert (codes_values[codes == 14] == 14).mean() > 0.9 and "wires (wires)" in output
+    assert (codes_values[codes == 17] == 17).mean() > 0.7 and "bridge decks" in output
     las = laspy.read(tmp_path / "out.las")
     assert np.array_equal(las.synthetic, flags) and np.array_equal(las.key_point, flags[::-1])
     kept = laspy.read(source)
-    left_out = (codes == 14) & (rng.random(len(xyz)) < 0.5)
+    left_out = (codes == 17) & (rng.random(len(xyz)) < 0.5)
     kept.classification[left_out] = 9
     kept.write(source)
     assert run(*words, *WHERE, *(("--resume",) if tiles else ()))[0] == 0
@@ -84,17 +83,17 @@ def test_bridges_and_polygons_of_points_that_the_model_gives_another_class(
 
 def test_in_a_pipeline_each_where_sees_the_classes_of_its_place(tmp_path, run_job, write_las):
     """As in PDAL; `mark` keeps what the first one saw."""
-    xyz, _ = scene(0, 3.0)
+    xyz, _ = scan(SCENES["overpass"](), 4.0)
     source = write(write_las, tmp_path / "in.las", xyz, 6)
     heights = {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]}
     model = {"type": "filters.modelclassifier", "model": "standard", "where": WHERE[1]}
-    wires = {}
+    decks = {}
     for where in (WHERE[1], "Mine == 1"):
         stages = [source, heights, model | {"mark": "Mine"}]
-        stages += [{"type": "filters.wires", "where": where}, tmp_path / "out.las"]
+        stages += [{"type": "filters.bridges", "where": where}, tmp_path / "out.las"]
         assert run_job(stages)[0] == 0
-        wires[where] = (np.asarray(laspy.read(tmp_path / "out.las").classification) == 14).sum()
-    assert not wires[WHERE[1]] and wires["Mine == 1"] > 100
+        decks[where] = (np.asarray(laspy.read(tmp_path / "out.las").classification) == 17).sum()
+    assert not decks[WHERE[1]] and decks["Mine == 1"] > 100
 
 
 # ---- overlap -----------------------------------------------------------------------------------------------
@@ -122,7 +121,7 @@ def test_class_0_with_the_overlap_flag_is_classified_in_las_14(tmp_path, run, wr
 def test_what_newer_pdal_reads_of_class_12(of_old_format, kept):
     """Class 12 of LAS 1.0-1.3 becomes class 0 with a flag; in LAS 1.4 these are two different things."""
     from pdal_stages.pipeline.pdal import overlap_as_flag
-    from pdal_stages.stages.wires import Wires
+    from pdal_stages.stages.bridges import Bridges
 
     arrays = {
         **dict.fromkeys("XYZ", np.zeros(3)),
@@ -131,7 +130,7 @@ def test_what_newer_pdal_reads_of_class_12(of_old_format, kept):
     }
     metadata = {"readers.las": {"dataformat_id": 1 if of_old_format else 6}}
     points = Points(arrays, overlap_as_flag=overlap_as_flag(arrays, metadata))
-    assert points.chosen(Wires({}).keep).tolist() == kept
+    assert points.chosen(Bridges({}).keep).tolist() == kept
 
 
 @pytest.mark.parametrize("door", ["classify", "pipeline"])
@@ -159,7 +158,7 @@ def test_a_mark_is_no_dimension_that_is_there(tmp_path, run, run_job, write_las,
 @pytest.mark.parametrize("tiles", [(), TILES])
 def test_points_are_selected_as_they_came_in(tmp_path, run, write_las, tiles):
     """By the input's own heights, which are all 0, not by those of this run; for every step."""
-    xyz, _ = scene(0, 3.0)
+    xyz, _ = scan(SCENES["overpass"](), 4.0)
     zero = np.zeros(len(xyz), np.float32)
     source = write(write_las, tmp_path / "in.las", xyz, 6, HeightAboveGround=zero)
     out = tmp_path / "out.las"
@@ -175,7 +174,7 @@ def test_points_are_selected_as_they_came_in(tmp_path, run, write_las, tiles):
     "where", ["Reliability < 0.5", "Reliability >= 0.5", "HeightAboveGround > 2"]
 )
 def test_a_condition_on_what_the_input_lacks_is_refused(tmp_path, run, write_las, where, tiles):
-    xyz, _ = scene(0, 3.0)
+    xyz, _ = scan(SCENES["overpass"](), 4.0)
     source = write(write_las, tmp_path / "in.las", xyz, 6, mine=np.zeros(len(xyz)))
     out = tmp_path / "out.las"
     code, _, err = run("classify", source, out, "--where", where, *tiles)

@@ -14,7 +14,17 @@ from typing import Any
 
 import numpy as np
 from leave_one_out import NAMES, at, group_table, survey_table
-from recipe import ABOVE, BELOW, DENSITIES, MOST, ONE_RETURN, OPTIONS
+from recipe import (
+    ABOVE,
+    BELOW,
+    DENSITIES,
+    LINE_DENSITY,
+    MOST,
+    ONE_RETURN,
+    OPTIONS,
+    TOWER_SAMPLES,
+    WIRE_SAMPLES,
+)
 from sources import SOURCES
 from surveys import GROUPS, SURVEYS
 
@@ -50,6 +60,10 @@ def _percent(part: float, whole: float) -> str:
     return f"{100 * part / whole:.1f}" if whole > 0 else "-"
 
 
+def _per_mille(part: float, whole: float) -> str:
+    return f"{1e3 * part / whole:.2f} ‰"
+
+
 def list_tests(tests: list[dict[str, Any]]) -> str:
     """Return the scores of the shipped model on test parts, as a sentence."""
     scored = " and ".join(f"{run['cloud']} {run['oa']:.1f} %" for run in tests)
@@ -57,6 +71,41 @@ def list_tests(tests: list[dict[str, Any]]) -> str:
         "On test parts of two towns whose other parts it was trained on, it is right in "
         f"{scored} (scored once).\nElsewhere expect the figures of the groups."
     )
+
+
+def describe_wires(scores: dict[str, list[dict[str, Any]]]) -> str:
+    """Return what models find of wires and towers that they have not seen, as Markdown."""
+    lines = [
+        "| by models that have not seen them | points | found | false |",
+        "|---|---:|---:|---:|",
+    ]
+    rows = []
+    for density in dict.fromkeys(row["density"] for row in scores["strips"]):
+        strips = [row for row in scores["strips"] if row["density"] == density]
+        rows.append(
+            (f"wires of the labeled line, strip by strip, at {density:g}/m²", "wire", strips)
+        )
+    for row in scores["strands"]:
+        rows.append((f"single strands hung over {row['survey']}", "wire", [row]))
+    for name in ("wire", "tower") if "crops" in scores else ():
+        title = f"{name}s in helicopter scans of Portuguese lines, 80 to 100/m² (not trained on)"
+        rows.append((title, name, scores["crops"]))
+    for title, name, each in rows:
+        there, found, false = (
+            sum(row[key] for row in each) for key in (name, f"{name} found", f"{name} false")
+        )
+        lines.append(f"| {title} | {there:,} | {_percent(found, there)} % | {false:,} |")
+    for wooded, title in ((False, "surveys without a line"), (True, "woods and slopes")):
+        each = [row for row in scores["false"] if row["wooded"] == wooded]
+        points = sum(row["points"] for row in each)
+        words = [
+            f"{name}s {_per_mille(sum(row[f'{name} false'] for row in each), points)}"
+            for name in ("wire", "tower")
+        ]
+        worst = max(each, key=lambda row: row["wire false"] / row["points"])
+        words.append(f"worst: {worst['cloud']}, {_per_mille(worst['wire false'], worst['points'])}")
+        lines.append(f"| {title}, as flown and thinned | {points:,} | | {', '.join(words)} |")
+    return "\n".join(lines)
 
 
 def survey_list(runs: list[dict[str, Any]]) -> str:
@@ -78,8 +127,9 @@ def survey_list(runs: list[dict[str, Any]]) -> str:
 
 def pages() -> dict[Path, str]:
     """Return the pages by their files."""
-    scores, tests = (
-        json.loads((RESULTS / f"{name}.json").read_text()) for name in ("surveys", "surveys-tests")
+    scores, tests, wires = (
+        json.loads((RESULTS / f"{name}.json").read_text())
+        for name in ("surveys", "surveys-tests", "wires")
     )
     runs = scores["surveys"]
     values = {
@@ -97,6 +147,10 @@ def pages() -> dict[Path, str]:
         "tests": list_tests(tests),
         "surveys": survey_list(runs),
         "count": OPTIONS.count,
+        "wires": describe_wires(wires),
+        "wire_samples": WIRE_SAMPLES,
+        "tower_samples": TOWER_SAMPLES,
+        "line_density": LINE_DENSITY,
         "most": MOST,
         "above": ABOVE,
         "below": BELOW,

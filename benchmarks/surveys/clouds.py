@@ -38,6 +38,19 @@ class ShrubRules:
 SHRUB_RULES = ShrubRules()
 
 
+@dataclass(frozen=True)
+class SkinRules:
+    """The edge of a survey, where only the skin of crowns was seen; lengths in meters. Not tuned."""
+
+    width: float = 15.0  #: of the strip along the edge
+    inside: float = 15.0  #: of what lies beside the strip
+    cell: float = 2.0  #: in which the highest point hides others ...
+    depth: float = 1.5  #: ... this much lower
+
+
+SKIN_RULES = SkinRules()
+
+
 def slug(name: str) -> str:
     """Return a survey's or a group's name as that of a file."""
     return name.replace(" ", "-").replace("'", "").replace(",", "")
@@ -227,3 +240,15 @@ def one_return(cloud: Cloud, last: bool) -> Cloud:
     kept = number >= of if last else number <= 1
     name = f"{cloud.name}, {'last' if last else 'first'} returns"
     return without_returns(cloud.part(np.flatnonzero(kept), name))
+
+
+def with_skin(cloud: Cloud) -> Cloud:
+    """Return a copy that ends, in the middle of its vegetation, at a strip of the skin of crowns."""
+    rules, x = SKIN_RULES, cloud.xyz[:, 0]
+    end = float(np.median(x[cloud.labels == VEGETATION]))
+    _, cell = np.unique(np.floor(cloud.xyz[:, :2] / rules.cell), axis=0, return_inverse=True)
+    highest = np.full(cell.max() + 1, -np.inf)
+    np.maximum.at(highest, cell, cloud.xyz[:, 2])
+    hidden = (x < end + rules.width) & (cloud.xyz[:, 2] < highest[cell] - rules.depth)
+    part = cloud.part(np.flatnonzero((x >= end) & ~hidden), f"{cloud.name}, ends at crowns")
+    return part.taken(np.flatnonzero(part.xyz[:, 0] < end + rules.width + rules.inside))

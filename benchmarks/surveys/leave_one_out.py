@@ -4,7 +4,7 @@
 
 Groups are whole countries and landscapes (`surveys.GROUPS`). Every survey is scored at its own
 density and thinned to 1 point per square meter. OA and F1 over ground, vegetation and building; low
-vegetation and what is none of the three is not scored. The figure to raise is the mean over groups
+vegetation and what is none of the three is not scored; `wires.py` scores wires. The figure to raise is the mean over groups
 of the mean OA over their surveys; beside it stand buildings in surveys without buildings.
 """
 
@@ -25,15 +25,20 @@ from surveys import (
     COAST,
     FOREST,
     GROUPS,
+    LINE_SURVEY,
     SLOPE,
     SURVEYS,
+    TOWER,
     VEGETATION,
+    WIRE,
     LabeledSurvey,
 )
+from wires import classified_strips, lines_model
 
 from pdal_stages import TrainingCloud
 from pdal_stages.accuracy import Accuracy
 from pdal_stages.classifier.calibration import Calibration
+from pdal_stages.classifier.prediction import Prediction
 from pdal_stages.reports.pictures import png, triptych
 
 #: Points per square meter that the surveys are thinned to.
@@ -41,6 +46,8 @@ THINNED = (1.0,)
 #: Surveys of which the card has a picture.
 PICTURED = ("Seville", "hamlet")
 NAMES = {2: "ground", 5: "vegetation", 6: "building"}
+#: Classes found, true classes and reliability (n,) of points.
+Judged = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def draw(found: np.ndarray, cloud: Cloud, pictures: Path) -> None:
@@ -52,8 +59,8 @@ def draw(found: np.ndarray, cloud: Cloud, pictures: Path) -> None:
 
 def score(found: np.ndarray, cloud: Cloud) -> dict[str, Any]:
     """Compare the classes (n,) that a model gave to a cloud with the truth."""
-    known = cloud.truth > 0
-    codes = sorted(set(cloud.truth[known].tolist()) | {2, 5, 6})
+    known = np.isin(cloud.truth, list(NAMES))
+    codes = sorted(set(found[known].tolist()) | set(NAMES))
     result = Accuracy.from_labels(cloud.truth[known], found[known], classes=codes)
     matrix = [
         [int(np.count_nonzero((cloud.truth == a) & (found == b))) for b in NAMES] for a in NAMES
@@ -82,6 +89,9 @@ def score(found: np.ndarray, cloud: Cloud) -> dict[str, Any]:
         "worst": worst,
         "share": 100 * wrong[worst] / int(known.sum()),
         "matrix": matrix,
+        "all": len(found),
+        "wires": int(np.count_nonzero(found == WIRE)),
+        "towers": int(np.count_nonzero(found == TOWER)),
     }
 
 
@@ -153,22 +163,28 @@ def survey_table(runs: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def judge(found: Prediction, truth: np.ndarray) -> Judged:
+    """Return what is known of the points that have a truth (n,)."""
+    known = truth > 0
+    return found.classification[known], truth[known], found.reliability[known]
+
+
 def calibrates(survey: LabeledSurvey) -> bool:
     """Return whether the limits of --keep-sure rest on a survey, see :func:`calibrate`."""
     return survey.landscape != COAST and not survey.tall and survey.tells(VEGETATION)
 
 
-def calibrate(judged: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Calibration:
+def calibrate(judged: dict[str, Judged], line: list[Judged]) -> Calibration:
     """Return how often models are right at which reliability, where vegetation is labeled.
 
     Rocks and scrub are left out: models that have seen no such land are surely wrong there, and the
-    shipped one has seen it. `judged` has classes, truth and reliability (n,) of the scored points
-    by survey.
+    shipped one has seen it. `judged` has what is known of the scored points by survey, `line` of
+    strips with wires, where wires alone count. Towers are not counted: one is labeled.
     """
     names = [name for name in judged if calibrates(SURVEYS[name])]
     out = Calibration(
         about=f"{len(names)} surveys ({', '.join(names)}), each classified by a model that had not "
-        "seen its group"
+        "seen its group; strips of a power line by models that had not seen its wires"
     )
     # Between all points alike and all surveys alike: limits should hold in a survey, not in the sum
     # of all.
@@ -177,6 +193,12 @@ def calibrate(judged: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> C
     for name, of_point in zip(names, weight, strict=True):
         codes, truth, reliability = judged[name]
         out.add(codes, truth, reliability, np.full(len(codes), of_point))
+    for codes, truth, reliability in line:
+        wire = codes == WIRE
+        of_point = np.full(np.count_nonzero(wire), weight.mean())
+        out.add(codes[wire], truth[wire], reliability[wire], of_point)
+    for table in (out.right, out.wrong):
+        table.pop(TOWER, None)
     return out
 
 
@@ -196,7 +218,7 @@ def main() -> None:
     args = options.parse_args()
     args.save.mkdir(parents=True, exist_ok=True)
     runs: list[dict[str, Any]] = []
-    judged = {}
+    judged: dict[str, Judged] = {}
     started = time.process_time()
     left_out = GroupsLeftOut(args.data, args.trained, args.save)
     print(f"features: {time.process_time() - started:.0f} CPU s", flush=True)
@@ -214,16 +236,21 @@ def main() -> None:
                 runs.append(score(found.classification, one))
                 print(json.dumps(runs[-1]), flush=True)
                 if one is cloud:
-                    known = one.truth > 0
-                    parts = (found.classification, one.truth, found.reliability)
-                    judged[name] = tuple(part[known] for part in parts)
+                    judged[name] = judge(
+                        found, np.where(np.isin(one.truth, list(NAMES)), one.truth, 0)
+                    )
                     if args.pictures and name in PICTURED:
                         draw(found.classification, one, args.pictures)
+    left_out.without(SURVEYS[LINE_SURVEY].group, with_lines=True).save(lines_model(args.save))
+    line = [
+        judge(found, truth)
+        for _, _, found, truth in classified_strips(args.data, args.save, args.pictures)
+    ]
     print(group_table(runs), survey_table(runs), sep="\n\n")
     if args.json:
         args.json.write_text(json.dumps({"surveys": runs}, indent=1) + "\n")
     if args.calibration:
-        counts = json.dumps(calibrate(judged).to_dict(), separators=(",", ":"))
+        counts = json.dumps(calibrate(judged, line).to_dict(), separators=(",", ":"))
         args.calibration.write_text(counts + "\n")
 
 

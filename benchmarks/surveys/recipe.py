@@ -5,10 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from zlib import crc32
 
 import numpy as np
-from clouds import Cloud, load, one_return, thinned, without_returns
-from surveys import BUILDING, FEW, GROUND, SHRUBS, SURVEYS, VEGETATION
+from clouds import Cloud, load, one_return, thinned, with_skin, without_returns
+from lines import STRIPS, Implant, LabeledLine, labeled_line, string_line
+from scipy.spatial import cKDTree
+from surveys import (
+    BUILDING,
+    FEW,
+    FOREST,
+    GROUND,
+    SHRUBS,
+    SLOPE,
+    SURVEYS,
+    TOWER,
+    VEGETATION,
+    WIRE,
+)
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, train
 from pdal_stages.base.hashing import hash_rows
@@ -20,6 +35,8 @@ DENSITIES = (8.0, 2.0, 0.6)
 #: Points per square meter, at most, of copies that have one return of each pulse, the first or the
 #: last.
 ONE_RETURN = (12.0, 3.0)
+#: The same of copies of woods that end where only the skin of crowns was seen.
+SKIN_DENSITIES = (8.0, 2.0)
 #: Height in meters below which a label of something standing is not believed, and above which a
 #: label of ground is not (not tuned): rocks that the filter cuts off taught that roofs may be
 #: ground.
@@ -31,25 +48,45 @@ MOST = 45_000
 MOST_OF_FEW = 16_000
 #: Samples of shrubs from each copy, at most (not tuned).
 SHRUB_SAMPLES = 250
+#: The same of wires and of towers: as many as these are of each class, with those of others 40,000,
+#: keep false wires rare (docs/trials.md).
+WIRE_SAMPLES, TOWER_SAMPLES = 30, 6
+#: What the probability of wires is multiplied by: a third of false wires for a tenth of single
+#: strands (docs/trials.md).
+FACTORS = {WIRE: 0.35}
+#: Points per square meter of the thinnest copies that have these: in thinner ones a wire is a few
+#: points that could be anything.
+LINE_DENSITY = 1.5
+#: And of vegetation and building each that looks like a wire, beside the samples of the survey:
+#: higher than :data:`LONE_HEIGHT` meters, on a line of 20 neighbors.
+LONE_SAMPLES, LONE_HEIGHT, LONE_LINEARITY = 200, 3.0, 0.6
+#: Heights that models read.
+HEIGHTS = ("HeightAboveGround", "HeightAboveOpening_5", "HeightAboveOpening_17")
+#: Features of 20 and of 50 neighbors.
+WIDE = (
+    *("Linearity", "Planarity", "Scattering", "Omnivariance", "Anisotropy", "Eigenentropy"),
+    *("EigenvalueSum", "SurfaceVariation", "Verticality", "HeightRange", "HeightStd"),
+    "HeightAboveLowest",
+)
+#: Features of 8 neighbors, for wires: those of 20 reach what is beside a sparse one.
+NARROW = ("Linearity", "HeightRange", "EigenvalueSum", "SurfaceVariation")
 OPTIONS = TrainingOptions(
-    neighborhoods="k20,k50",
-    feature_set="covariance,Verticality,HeightRange,HeightStd,HeightAboveLowest,"
-    "NormalAgreement_k20,SurfaceVariationMin_k20",
-    dimensions=(
-        "HeightAboveGround",
-        "Ground",
-        "HeightAboveOpening_5",
-        "HeightAboveOpening_17",
-        "returns",
+    neighborhoods="k8,k20,k50",
+    feature_set=(
+        *(f"{name}_k8" for name in NARROW),
+        *(f"{name}_{token}" for token in ("k20", "k50") for name in WIDE),
+        *("NormalAgreement_k20", "SurfaceVariationMin_k20"),
     ),
-    classes={"2": 2, "3,5": 5, "6": 6},
+    dimensions=("HeightAboveGround", "Ground", *HEIGHTS[1:], "returns", "GapBelow"),
+    classes={"2": 2, "3,5": 5, "6": 6, "14": 14, "15": 15},
     count=40_000,
     trees=40,
     max_samples=1.0,
     min_samples_leaf=10,
     prior_weight=0.0,
     passes=2,
-    context=("own", "box1", "box4", "columnvotes2", "columnvotes4", "segments6"),
+    context=("own", "box1", "box4", "columnvotes2", "columnvotes4", "segments6", "lines14"),
+    fill_up=False,
     folds=0,
     voxel=0.25,
 )
@@ -59,7 +96,7 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
     """Yield a survey and its thinned copies.
 
     Where it has return numbers, each comes once more without these, and there are copies with one
-    return of each pulse.
+    return of each pulse. Woods come with an edge, too.
     """
     made = [cloud, *(thinned(cloud, density) for density in DENSITIES)]
     for one in made:
@@ -72,19 +109,30 @@ def copies(cloud: Cloud) -> Iterator[Cloud]:
         for density in ONE_RETURN:
             for last in (False, True):
                 yield one_return(thinned(cloud, density) or cloud, last)
+    if SURVEYS[cloud.survey].landscape in (FOREST, SLOPE):
+        for density in SKIN_DENSITIES:
+            yield with_skin(thinned(cloud, density) or cloud)
 
 
-def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
-    """Return a survey's copy of this number as it is trained on: a square, with a mask of samples.
+def squares(data: Path, survey: str) -> list[Cloud]:
+    """Return the parts of a survey's copies that are trained on, one point for each voxel."""
+    known, out = SURVEYS[survey], []
+    most = MOST_OF_FEW if known.samples == FEW else MOST
+    for cloud in copies(load(data, survey)):
+        representatives = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
+        if representatives is not None:
+            cloud = cloud.taken(representatives.rows)
+        for _ in range(known.squares):
+            out.append(cloud.taken(square(cloud, most, len(out))))
+    return out
+
+
+def training_cloud(cloud: Cloud) -> TrainingCloud:
+    """Return a square with a mask of samples.
 
     The mask has as many points of each class as the survey gives from a copy, chosen by their
     coordinates.
     """
-    representatives = represent(cloud.xyz, OPTIONS.voxel, cloud.dimensions.values())
-    if representatives is not None:
-        cloud = cloud.taken(representatives.rows)
-    few = SURVEYS[cloud.survey].samples == FEW
-    cloud = cloud.taken(square(cloud, MOST_OF_FEW if few else MOST, number))
     order = np.argsort(hash_rows(cloud.xyz.T, 1), kind="stable")
     mask = np.zeros(len(order), np.bool_)
     whole = TrainingCloud(
@@ -92,9 +140,30 @@ def training_cloud(cloud: Cloud, number: int) -> TrainingCloud:
     )
     usable = np.where(contradicted(cloud), 0, cloud.labels)
     samples = dict.fromkeys((GROUND, VEGETATION, BUILDING), SURVEYS[cloud.survey].samples)
-    for code, most in {**samples, SHRUBS: SHRUB_SAMPLES}.items():
+    samples[SHRUBS] = SHRUB_SAMPLES
+    if cloud.density >= LINE_DENSITY:
+        samples |= {WIRE: WIRE_SAMPLES, TOWER: TOWER_SAMPLES}
+    for code, most in samples.items():
         mask[order[usable[order] == code][:most]] = True
+    tree = cKDTree(cloud.xyz)
+    high = cloud.dimensions["HeightAboveGround"][order] > LONE_HEIGHT
+    for code in (VEGETATION, BUILDING):
+        rows = order[high & (usable[order] == code)]
+        mask[lone(cloud.xyz, tree, rows)] = True
     return replace(whole, mask=mask)
+
+
+def lone(xyz: np.ndarray, tree: cKDTree, rows: np.ndarray) -> np.ndarray:
+    """Return the first :data:`LONE_SAMPLES` of the rows (m,) whose neighbors lie along a line."""
+    out: list[np.ndarray] = []
+    for part in np.array_split(rows, max(1, len(rows) // 1000)):
+        if not len(part) or sum(map(len, out)) >= LONE_SAMPLES or len(xyz) < 20:
+            break
+        near = xyz[tree.query(xyz[part], 20)[1]]
+        near -= near.mean(axis=1, keepdims=True)
+        values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", near, near))
+        out.append(part[values[:, 2] - values[:, 1] > LONE_LINEARITY * values[:, 2]])
+    return np.concatenate([np.zeros(0, np.int64), *out])[:LONE_SAMPLES]
 
 
 def contradicted(cloud: Cloud | TrainingCloud) -> np.ndarray:
@@ -113,11 +182,12 @@ def square(cloud: Cloud, most: int, number: int) -> np.ndarray:
     """Return rows, ascending, of a square of at most `most` points around a labeled point.
 
     The `number` of a copy decides around which: a building, vegetation and ground in turn, as far
-    as there are any. The square lies inside the cloud where it fits.
+    as there are any; or wires alone, where these are labeled. The square lies inside the cloud where it fits.
     """
     if len(cloud.xyz) <= most:
         return np.arange(len(cloud.xyz))
-    codes = [code for code in (6, 5, 2) if (cloud.labels == code).any()]
+    wanted = (WIRE,) if (cloud.labels == WIRE).any() else (BUILDING, VEGETATION, GROUND)
+    codes = [code for code in wanted if (cloud.labels == code).any()]
     labeled = np.flatnonzero(cloud.labels == codes[number % len(codes)])
     order = np.argsort(hash_rows(cloud.xyz[labeled].T, 7), kind="stable")
     center = cloud.xyz[labeled[order[number * 17 % len(labeled)]], :2]
@@ -129,13 +199,70 @@ def square(cloud: Cloud, most: int, number: int) -> np.ndarray:
     return np.sort(np.argsort(away, kind="stable")[:most])
 
 
+def with_line(cloud: Cloud, line: LabeledLine, number: int) -> Cloud:
+    """Return a square with a line across it, made of the strip that :func:`strip_of` names."""
+    ground = cloud.xyz[:, 2] - cloud.dimensions["HeightAboveGround"]
+    seed = (crc32(cloud.survey.encode()), number)
+    strips = (strip_of(number),)
+    return set_in(cloud, string_line(line, strips, cloud.xyz, ground, cloud.density, seed))
+
+
+def set_in(cloud: Cloud, implant: Implant) -> Cloud:
+    """Return a cloud with the points of an implant.
+
+    Their heights are above the surfaces of the nearest point in plan. They have return numbers
+    where the cloud has any.
+    """
+    heights = {name: np.asarray(cloud.dimensions[name]) for name in HEIGHTS}
+    near = cKDTree(cloud.xyz[:, :2]).query(implant.xyz[:, :2])[1]
+    has_returns = bool(np.any(cloud.dimensions["NumberOfReturns"]))
+    count = np.where(implant.several, 2, 1) * has_returns
+    added = {
+        **{
+            name: implant.xyz[:, 2] - (cloud.xyz[near, 2] - values[near])
+            for name, values in heights.items()
+        },
+        "Ground": np.zeros(len(near)),
+        "ReturnNumber": np.minimum(count, 1),
+        "NumberOfReturns": count,
+    }
+    dimensions = {
+        name: np.concatenate([values, added[name].astype(values.dtype)])
+        for name, values in cloud.dimensions.items()
+    }
+    return replace(
+        cloud,
+        xyz=np.concatenate([cloud.xyz, implant.xyz]),
+        labels=np.concatenate([cloud.labels, implant.labels]),
+        truth=np.concatenate([cloud.truth, implant.labels]),
+        dimensions=dimensions,
+    )
+
+
+def strip_of(number: int) -> int:
+    """Return the strip of the labeled line that the square of this number has wires of."""
+    return number % STRIPS
+
+
 def training_clouds(data: Path, survey: str) -> list[TrainingCloud]:
     """Return the copies of a survey that are trained on."""
-    return [training_cloud(copy, number) for number, copy in enumerate(copies(load(data, survey)))]
+    clouds, line = squares(data, survey), labeled_line(data)
+    if not SURVEYS[survey].tells(WIRE):
+        clouds = [
+            with_line(cloud, line, number) if cloud.density >= LINE_DENSITY else cloud
+            for number, cloud in enumerate(clouds)
+        ]
+    return [training_cloud(cloud) for cloud in clouds]
 
 
 def train_on(data: Path, surveys: Iterable[str], options: TrainingOptions = OPTIONS) -> Model:
     """Return the model of these surveys."""
     model = train([one for name in surveys for one in training_clouds(data, name)], options)
     model.record_preprocessing(PREPARATION)
+    model.info["priors"] = priors(model.codes.tolist())
     return model
+
+
+def priors(codes: Iterable[int]) -> dict[str, Any]:
+    """Return what a manifest says of the classes' factors."""
+    return {"weight": 0.0, "factors": [FACTORS.get(code, 1.0) for code in codes]}

@@ -1,6 +1,7 @@
 """The open, labeled surveys that models are trained on and judged by; what their labels mean.
 
-Labels become 2 ground, 5 vegetation, 6 building and 0, which is left out of training and scoring.
+Labels become 2 ground, 5 vegetation, 6 building, 14 wire, 15 tower and 0, which is left out of
+training and scoring.
 Low vegetation (3) is left out: in these surveys most of it lies on the ground, and where it begins
 is a matter of taste. 3 stands for shrubs that :func:`clouds.find_shrubs` finds among everything
 else; they are trained on as vegetation and not scored.
@@ -11,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-GROUND, VEGETATION, BUILDING = 2, 5, 6
+GROUND, VEGETATION, BUILDING, WIRE, TOWER = 2, 5, 6, 14, 15
 SHRUBS = 3
 
 
@@ -48,6 +49,8 @@ class LabeledSurvey:
     samples : int
         Of each class from each copy, at most: fewer from what is alike all over, or has one
         building.
+    squares : int
+        Parts of each copy that are trained on.
     mislabeled : tuple of boxes
         West, south, east, north of where the labels were looked at and are wrong: nothing is
         learned from them, and errors are not counted.
@@ -67,11 +70,14 @@ class LabeledSurvey:
     tall_scored: bool = False
     returns: bool = True
     samples: int = 1500
+    squares: int = 1
     mislabeled: tuple[tuple[float, float, float, float], ...] = ()
 
     def tells(self, label: int) -> bool:
-        """Return whether labels tell a class: vegetation may share a code with the rest."""
-        return label != VEGETATION or label in self.labels.values() or self.tall_scored
+        """Return whether labels tell a class: it may share a code with the rest."""
+        if label not in (VEGETATION, WIRE, TOWER):
+            return True
+        return label in self.labels.values() or (label == VEGETATION and self.tall_scored)
 
 
 _LIDARHD = "IGN, LiDAR HD, Licence Ouverte Etalab 2.0"
@@ -147,7 +153,7 @@ SURVEYS = {
     ),
     "power line": LabeledSurvey(
         ("rural/ahn4_powerline.laz",),
-        {2: GROUND, 5: VEGETATION, 9: GROUND},
+        {2: GROUND, 5: VEGETATION, 9: GROUND, 14: WIRE, 15: TOWER},
         "Dutch meadows and woods under a power line (AHN4)",
         _AHN,
         FARMLAND,
@@ -155,6 +161,7 @@ SURVEYS = {
         dropped=(7, 18, 26, 1),
         returns=False,
         samples=FEW,
+        squares=5,
     ),
     "bank": LabeledSurvey(
         ("rural/lidarhd_bank.laz",),
@@ -396,6 +403,8 @@ SURVEYS = {
         samples=FEW,
     ),
 }
+#: The survey that has labeled wires and a tower.
+LINE_SURVEY = "power line"
 #: Test parts of two surveys, scored once by the shipped model.
 TESTS = {
     "Montpellier": ("montpellier/test_77060_627755.laz", "montpellier/test_77060_627760.laz"),

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.threads import map_blocks, resolve_threads
-from ..classifier.input_dimensions import add_return_features, take_dimensions
+from ..classifier.input_dimensions import add_surroundings, take_dimensions
 from ..classifier.interface import ArrayRule, Block, InputPlan, PredictRequest
 from .batches import Batches, Pyramid, augment, build_pyramid, halo_m, random_order
 from .configuration import REACH, Configuration, parse_configuration
@@ -114,7 +114,7 @@ class AlsNet:
         The variance of a class's probability over the batches, mean over the classes, marks errors
         [WM19 5].
         """
-        known = add_return_features(self.inputs, request.xyz, request.dimensions, request.threads)
+        known = add_surroundings(self.inputs, request.xyz, request.dimensions, request.threads)
         values = take_dimensions(self.inputs, known, len(request.xyz))
         if not request.count:
             return

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..base.errors import OptionError
 from ..base.threads import resolve_threads
-from ..classifier.input_dimensions import add_return_features, take_dimensions
+from ..classifier.input_dimensions import add_surroundings, take_dimensions
 from ..classifier.sampling import Folds
 from ..classifier.training_clouds import TrainingCloud, label_classes
 from ..classifier.training_options import TrainingOptions
@@ -101,7 +101,7 @@ def _concatenate_inputs(
     """Return the values (n,) of all inputs that are dimensions, of all clouds."""
     parts = []
     for cloud in clouds:
-        known = add_return_features(inputs, cloud.xyz, cloud.dimensions, threads)
+        known = add_surroundings(inputs, cloud.xyz, cloud.dimensions, threads)
         parts.append(take_dimensions(inputs, known, len(cloud), where=cloud.name))
     return {
         name: np.concatenate([part[name] for part in parts]).astype(np.float64) for name in parts[0]

@@ -43,6 +43,7 @@ MEDIUM_VEGETATION = 4
 HIGH_VEGETATION = 5
 BUILDING = 6
 WIRE = 14  #: conductors
+TOWER = 15  #: transmission towers
 BRIDGE = 17  #: bridge decks
 WATER = 9
 #: Classes of the terrain's surface, which ground that is given consists of: ground, water, road.

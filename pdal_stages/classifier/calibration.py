@@ -66,6 +66,8 @@ class ReliabilityLimits:
                 right = f"at most {100 * limit.accuracy:.1f} % of the most reliable were right"
                 cost = f"no point keeps it, as {right}"
             lines.append(f"  {code} {names.get(code, '')}".rstrip() + f": {cost}")
+        for code in sorted(names.keys() - self.classes.keys()):
+            lines.append(f"  {code} {names[code]}: nothing is promised, all points keep it")
         return lines
 
 

@@ -26,7 +26,9 @@ from ..base.grid import compact_keys, places_among
 from ..base.threads import map_blocks
 from ..features.cell_means import WHOLE, cell_means
 from ..features.neighborhoods import SIDES
-from .segments import COLUMNS, RULES, SegmentContext, describe_segments
+from . import lines, segments
+from .lines import LineContext, describe_lines
+from .segments import SegmentContext, describe_segments
 
 #: Word of a token, before the side of a cell in meters: axes of the cells (3 x 3 x 3 around the
 #: point's, or 3 x 3 columns of any height), and whether it reads shares of votes for each class in
@@ -37,6 +39,8 @@ CELLS = {"box": (3, False), "column": (2, False), "boxvotes": (3, True), "column
 OWN = "own"
 #: Word of a token, which the code of a class follows: what its segments are like.
 SEGMENTS = "segments"
+#: Word of a token, which the code of a class follows: what its lines are like.
+LINES = "lines"
 #: Dimension that segments read.
 HEIGHT = "HeightAboveGround"
 
@@ -45,7 +49,8 @@ HEIGHT = "HeightAboveGround"
 class Context:
     """Features of the surroundings that a pass reads; OptionError for an unknown token."""
 
-    #: ``own``, a word of :data:`CELLS` and a side (``box1``, ``columnvotes8``), or ``segments6``
+    #: ``own``, a word of :data:`CELLS` and a side (``box1``, ``columnvotes8``), ``segments6`` or
+    #: ``lines14``
     tokens: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -63,7 +68,7 @@ class Context:
         """Side of the cells, axes, and whether votes are read, by token that has cells."""
         scales = {}
         for token in self.tokens:
-            if token == OWN or token in self.segment_codes:
+            if token == OWN or token in {**self.segment_codes, **self.line_codes}:
                 continue
             match = re.fullmatch(rf"({'|'.join(CELLS)})(\d+(?:\.\d+)?)", token)
             if match is None or float(match[2]) not in SIDES:
@@ -71,8 +76,8 @@ class Context:
                     "a token of 'context' is not known",
                     found=repr(token)[:60],
                     cure=f"Write {OWN}, or {', '.join(CELLS)} and a side in meters that is a power "
-                    f"of two from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8; or {SEGMENTS} and "
-                    "the code of a class",
+                    f"of two from {SIDES[0]:g} to {SIDES[-1]:g}: box1, column8; or {SEGMENTS} or "
+                    f"{LINES} and the code of a class",
                 )
             scales[token] = (float(match[2]), *CELLS[match[1]])
         return scales
@@ -80,14 +85,25 @@ class Context:
     @cached_property
     def segment_codes(self) -> dict[str, int]:
         """Class of the tokens of segments."""
-        matches = {token: re.fullmatch(rf"{SEGMENTS}(\d{{1,3}})", token) for token in self.tokens}
+        return self._codes(SEGMENTS)
+
+    @cached_property
+    def line_codes(self) -> dict[str, int]:
+        """Class of the tokens of lines."""
+        return self._codes(LINES)
+
+    def _codes(self, word: str) -> dict[str, int]:
+        """Return the class of the tokens that are a word and a code."""
+        matches = {token: re.fullmatch(rf"{word}(\d{{1,3}})", token) for token in self.tokens}
         return {token: int(match[1]) for token, match in matches.items() if match}
 
     @property
     def strip(self) -> float:
         """Width in meters of strips: a point reads three of them; 0 without context."""
         sides = [side for side, _, _ in self.scales.values()]
-        return max(sides + [RULES.block] * bool(self.segment_codes), default=0.0)
+        blocks = [segments.RULES.block] * bool(self.segment_codes)
+        blocks += [lines.RULES.block] * bool(self.line_codes)
+        return max(sides + blocks, default=0.0)
 
     @property
     def reach(self) -> float:
@@ -98,8 +114,11 @@ class Context:
         """Return names of columns like ``Probability_2_box0_5``, by classes of the pass before."""
         names: list[str] = []
         for token in self.tokens:
-            of_codes = [f"Probability_{code}" for code in codes]
-            features = COLUMNS if token in self.segment_codes else of_codes
+            features: Sequence[str] = [f"Probability_{code}" for code in codes]
+            if token in self.segment_codes:
+                features = segments.COLUMNS
+            elif token in self.line_codes:
+                features = lines.COLUMNS
             names += [f"{feature}_{token.replace('.', '_')}" for feature in features]
         return tuple(names)
 
@@ -111,7 +130,7 @@ class Context:
         codes: Sequence[int] = (),
         height: npt.ArrayLike | None = None,
     ) -> CellContext:
-        """Return the mean shares of all cells, and the segments.
+        """Return the mean shares of all cells, the segments and the lines.
 
         Parameters
         ----------
@@ -121,24 +140,26 @@ class Context:
         shares : (n, classes) uint16
             Of each point; see :func:`count_shares`.
         codes : sequence of int
-            Classes of the shares; only segments need them.
+            Classes of the shares; only segments and lines need them.
         height : (n,) array_like
             Heights above ground in meters; only segments need them.
         """
         jobs = [(xyz[:, :axes], shares, side, votes) for side, axes, votes in self.scales.values()]
         means = map_blocks(lambda job: cell_means(*job), jobs, threads)
-        segments = {}
+        described: dict[str, SegmentContext | LineContext] = {}
+        ground = codes.index(GROUND) if GROUND in codes else None
         for token, code in self.segment_codes.items():
             assert height is not None
             # Votes for ground do not count against those of a segment.
-            target, ground = codes.index(code), codes.index(GROUND) if GROUND in codes else None
-            heights = np.asarray(height, np.float64)
-            segments[token] = describe_segments(xyz, shares, heights, target, ground)
+            heights, target = np.asarray(height, np.float64), codes.index(code)
+            described[token] = describe_segments(xyz, shares, heights, target, ground)
+        for token, code in self.line_codes.items():
+            described[token] = describe_lines(xyz, shares, codes.index(code), ground)
         cells = dict(zip(self.scales, means, strict=True))
-        return CellContext(self.tokens, shares, cells, segments)
+        return CellContext(self.tokens, shares, cells, described)
 
-    def check_segments(self, codes: Sequence[int], dimensions: Sequence[str]) -> None:
-        """Raise a ModelError where segments need what is not there.
+    def check_codes(self, codes: Sequence[int], dimensions: Sequence[str]) -> None:
+        """Raise a ModelError where segments or lines need what is not there.
 
         `codes` are the classes of the pass before, `dimensions` what the pass reads of the points.
         """
@@ -149,6 +170,13 @@ class Context:
                     found=f"classes {list(codes)}; dimensions {', '.join(dimensions)}"[:200],
                     cure=f"Name {HEIGHT} among the dimensions, or leave '{token}' out of the "
                     "context",
+                )
+        for token, code in self.line_codes.items():
+            if code not in codes:
+                raise ModelError(
+                    f"the context '{token}' needs class {code}",
+                    found=f"classes {list(codes)}"[:200],
+                    cure=f"Train on wires, or leave '{token}' out of the context",
                 )
 
     def own_probabilities(
@@ -170,7 +198,8 @@ class CellContext:
     #: of the tokens that have cells: (n,) the cell of each point, (cells, classes) the means around
     #: each cell
     cells: Mapping[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]]
-    segments: Mapping[str, SegmentContext]  #: of the tokens of segments
+    #: of the tokens of segments and lines
+    described: Mapping[str, SegmentContext | LineContext]
 
     def columns(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """Return the columns (b, columns) of some of the points, token by token."""
@@ -178,8 +207,8 @@ class CellContext:
         for token in self.tokens:
             if token == OWN:
                 parts.append(self.shares[rows] / WHOLE)
-            elif token in self.segments:
-                parts.append(self.segments[token].columns(rows))
+            elif token in self.described:
+                parts.append(self.described[token].columns(rows))
             else:
                 cell, mean = self.cells[token]
                 parts.append(mean[cell[rows]])

@@ -14,7 +14,7 @@ from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.engine import FeatureBlock, Run
 from .context_features import OWN, Context
-from .input_dimensions import add_return_features, take_dimensions
+from .input_dimensions import add_surroundings, take_dimensions
 from .interface import FOREST, REFINED_FOREST, Estimator, PredictRequest
 from .learner import Learner
 
@@ -73,9 +73,7 @@ class CloudFeatures:
         self.features, self._request = features, request
         self._engine: FeatureEngine | None = None
         names = features.plan.dimensions
-        self._dimensions = add_return_features(
-            names, request.xyz, request.dimensions, request.threads
-        )
+        self._dimensions = add_surroundings(names, request.xyz, request.dimensions, request.threads)
         # An error of these is raised here, before any work.
         take_dimensions(names, self._dimensions, len(request.xyz), request.rows)
 
@@ -258,7 +256,7 @@ class FeatureForest:
                 found=", ".join(names[-3:]),
             )
         if context is not None:
-            context.check_segments(before, entry["dimensions"])
+            context.check_codes(before, entry["dimensions"])
         features = Features.from_dict(entry, names[:count])
         forest = learner.from_arrays(arrays, len(names), len(labeled))
         kind = FOREST if blend is not None else entry["algorithm"]

@@ -10,6 +10,8 @@ import numpy.typing as npt
 
 from ..base.errors import DimensionError
 from ..features import return_features
+from ..features.gap_below import NAME as GAP_BELOW
+from ..features.gap_below import gap_below
 
 #: Dimensions of every point; the feature engine takes them from the coordinates.
 COORDINATES = ("X", "Y", "Z")
@@ -35,8 +37,11 @@ _CURES = {
 
 
 def required_dimensions(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the dimensions among feature names: neither coordinates nor return features."""
-    known = (*COORDINATES, *return_features.NAMES)
+    """Return the dimensions among feature names that a cloud must have.
+
+    These are neither coordinates nor what :func:`add_surroundings` computes.
+    """
+    known = (*COORDINATES, *return_features.NAMES, GAP_BELOW)
     return tuple(dict.fromkeys(name for name in names if name not in known))
 
 
@@ -65,17 +70,19 @@ def list_values(
     return [np.asarray(dimensions[name]) for name in read]
 
 
-def add_return_features(
+def add_surroundings(
     names: Iterable[str],
     xyz: npt.NDArray[np.float64],
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
 ) -> Mapping[str, npt.ArrayLike]:
-    """Return the dimensions (n,) with the return features among `names`.
+    """Return the dimensions (n,) with the return features and the gap below among `names`.
 
     These are computed from return numbers and the points (n, 3) around.
     """
+    names = tuple(names)
     computed = return_features.return_features(names, xyz, dimensions, threads)
+    computed |= gap_below(names, xyz)
     return {**dimensions, **computed} if computed else dimensions
 
 
@@ -92,7 +99,7 @@ def take_dimensions(
     ----------
     names : iterable of str
     dimensions : mapping of str to (n,) array
-        See :func:`add_return_features`.
+        See :func:`add_surroundings`.
     rows : (m,) int64, optional
         All n by default.
     where : str, optional

@@ -94,6 +94,7 @@ def draw_samples(
     seed: int,
     groups: Sequence[str] | None = None,
     *,
+    fill_up: bool = True,
     random_order: bool = False,
     progress: Progress | None = None,
 ) -> Samples:
@@ -103,9 +104,9 @@ def draw_samples(
     point out. No more samples are drawn than the largest class has points; a class with fewer gives
     each of them count/n times, rounded down or up. With `random_order` samples are drawn at random
     from all points of a class instead of spread over the ground, and each class gives `count`, if
-    only as duplicates. Clouds of one of the `groups` give as many of a class as those of the
-    others, as far as they have them. `progress` is updated with the points looked at: all of them
-    once, and once more for each class.
+    only as duplicates. Without `fill_up` no point is drawn twice. Clouds of one of the `groups`
+    give as many of a class as those of the others, as far as they have them. `progress` is updated
+    with the points looked at: all of them once, and once more for each class.
     """
     names, of_cloud = np.unique(groups or [""] * len(clouds), return_inverse=True)
     there = np.zeros((len(names), n_classes), np.int64)
@@ -121,7 +122,8 @@ def draw_samples(
     is_alone = np.count_nonzero(there.any(axis=1)) == 1
     parts = []
     for position in range(n_classes):
-        quota = share_out(there[:, position], count)
+        of_class = count if fill_up else min(count, int(available[position]))
+        quota = share_out(there[:, position], of_class)
         for group in np.flatnonzero(quota):
             state = [seed, position]
             if not is_alone:

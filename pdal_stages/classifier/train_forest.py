@@ -114,7 +114,7 @@ class ForestTraining:
         self.context = Context(tuple(options.context))
         known = self.codes if self.base is None else self.base.codes.tolist()
         if options.passes > 1 or self.base is not None:
-            self.context.check_segments(known, trainer.inputs(options))
+            self.context.check_codes(known, trainer.inputs(options))
         self.blend: Blend | None = None
         #: What the first pass reads of the samples.
         self.first = self.values
@@ -139,6 +139,7 @@ class ForestTraining:
                 options.count,
                 options.seed,
                 groups,
+                fill_up=options.fill_up,
                 random_order=options.sampling == "random",
                 progress=bar,
             )

@@ -67,8 +67,8 @@ class TrainingOptions(Settings):
     dimensions: Sequence[str] = setting(
         ("HeightAboveGround",),
         "list",
-        "Dimensions of the points to use as features as well, e.g. HeightAboveGround, Intensity, "
-        "or returns (all return features)",
+        "Dimensions of the points to use as features as well, e.g. HeightAboveGround, Intensity; "
+        "or what is computed of points around: returns (all return features), GapBelow",
         check=checks.names,
     )
     classes: Any = setting(
@@ -84,9 +84,15 @@ class TrainingOptions(Settings):
     count: int = setting(
         40_000,
         "integer",
-        "Samples per class; smaller classes are filled up with duplicates",
+        "Samples per class",
         1,
         10**8,
+    )
+    fill_up: bool = setting(
+        True,
+        "boolean",
+        "Fill up smaller classes with duplicates, so that all weigh alike; without it a class that "
+        "is rare in the labels is rare in the samples",
     )
     sampling: str = setting(
         "spread",
@@ -199,7 +205,7 @@ class TrainingOptions(Settings):
         None,
         "list",
         "What passes after the first use: own; box, boxvotes, column, columnvotes and a cell size "
-        "(box0.5); segments and a class (segments6); default: "
+        "(box0.5); segments or lines and a class (segments6, lines14); default: "
         f"{','.join(DEFAULT_CONTEXT)}; with a base {','.join(CONTEXT_OF_BASE)}",
     )
     base: Any = setting(

@@ -52,7 +52,6 @@ def add_commands(parser: Parser) -> None:
     for flag, default, help in (
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
         ("--bridges", False, "Find bridge decks, class 17"),
-        ("--wires", False, "Find wires, class 14; without it they become building"),
     ):
         add(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
     polygons = (
@@ -81,7 +80,6 @@ def _request(options: argparse.Namespace) -> ClassifyRequest:
         stage_options(options, *_CLASSIFIER_OPTIONS),
         noise=options.noise,
         bridges=options.bridges,
-        wires=options.wires,
         polygons=tuple(options.polygons),
         given_ground=options.ground == "given",
     )

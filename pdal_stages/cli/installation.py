@@ -198,7 +198,6 @@ def _warmup(options: argparse.Namespace) -> None:
     from ..objects.crowns import crown_cells
     from ..objects.roofs import planes
     from ..structures.decks import find_decks
-    from ..structures.wires import find_wires
     from ..terrain import detached_noise, filtered_ground, hag_minima
 
     # A deck over a valley, with land at both ends, so that the kernels for decks run as well.
@@ -206,9 +205,6 @@ def _warmup(options: argparse.Namespace) -> None:
     z = np.where(abs(y) <= 4.0, 6.0, np.clip((abs(x) - 15.0) / 7.5, 0.0, 6.0))
     on_ground = filtered_ground(x, y, z, openings=(5,), threads=1)["Ground"] > 0
     find_decks(x, y, z, np.ones(len(x), bool), on_ground)
-    x = np.arange(-60.0, 60.0, 0.5)
-    wire = np.column_stack((x, np.zeros_like(x), 12.0 - abs(x) / 20.0))
-    find_wires(wire, wire[:, 2], np.ones(len(x), bool))
     xyz = np.random.default_rng(0).uniform(0.0, 12.0, (400, 3))
     xyz[1] = xyz[0]  # one stands for both
     axes = np.ascontiguousarray(xyz.T)
@@ -219,7 +215,7 @@ def _warmup(options: argparse.Namespace) -> None:
     how = TrainingOptions(
         neighborhoods="s5,k10",
         feature_set="covariance,geometric,surfaces",
-        dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "returns"),
+        dimensions=("HeightAboveGround", "Ground", "HeightAboveOpening_5", "returns", "GapBelow"),
         context=("own", "segments6", *TrainingOptions().context),  # as shipped models read
         trees=1,
         count=50,

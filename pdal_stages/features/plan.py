@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import OptionError, suggest
-from . import return_features
+from . import gap_below, return_features
 from .neighborhoods import (
     AROUND,
     RADIUS_MEMBERS,
@@ -176,6 +176,8 @@ class FeaturePlan:
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
         reach = max(reach, return_features.reach(self.dimensions))
+        if gap_below.NAME in self.dimensions:
+            reach = max(reach, gap_below.REACH)
         if any(n.reach is None for n in self.neighborhoods):
             reach = max(reach, POINTS_HALO)
         for columns in self.layout:

@@ -43,7 +43,6 @@ class ClassifyRequest:
     classifier_options: Mapping[str, Any] = field(default_factory=dict)
     noise: bool = True  #: mark low and high noise first
     bridges: bool = False  #: find bridge decks, where heights are those of `_GROUND`
-    wires: bool = False  #: find wires, where heights are computed
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     given_ground: bool = False  #: points of the classes TERRAIN are the ground, and stay so
 
@@ -134,14 +133,12 @@ class ClassifyRequest:
             name: settled[name] for name in ("ignore", "keep") if name in settled
         }
         kept = split_selection(shared.get("keep", OVERLAP))
-        finders = {**shared}
-        if keep_ground:
-            finders["keep"] = [*(kept if isinstance(kept, list) else [kept]), *TERRAIN]
         stages: list[dict[str, Any]] = []
         if self.bridges:
-            stages.append({"type": "filters.bridges", **finders})
-        if self.wires:
-            stages.append({"type": "filters.wires", **finders})
+            bridges = {"type": "filters.bridges", **shared}
+            if keep_ground:
+                bridges["keep"] = [*(kept if isinstance(kept, list) else [kept]), *TERRAIN]
+            stages.append(bridges)
         if self.polygons:
             polygons = {"type": "filters.polygons", "polygons": list(self.polygons)}
             stages.append({**polygons, **shared})

@@ -15,6 +15,7 @@ from typing import Any
 
 from ..base.checks import refuse_constant, refuse_nested
 from ..base.errors import OptionError, PipelineError, suggest
+from ..stages.registry import refuse_removed
 
 #: No pipeline file has as many bytes; devices, such as /dev/zero, have no end.
 _MOST_BYTES = 1 << 26
@@ -149,6 +150,8 @@ def _checked(source: PipelineSource) -> PipelineSource:
             value = json.dumps(stage, default=str)[:80]
             raise PipelineError("a stage is an object, or a file name", where=where, found=value)
         _check_values(stage, where)
+        if isinstance(stage, dict):
+            refuse_removed(str(stage.get("type", "")), where)
         for key in ("type", "tag", "inputs") if isinstance(stage, dict) else ():
             value = stage.get(key, "")  # type: ignore[union-attr]
             texts = value if key == "inputs" and isinstance(value, list) else [value]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import BRIDGE
+from ..base.asprs import BRIDGE, TOWER, WIRE
 from ..structures.decks import RULES, find_decks
 from .base import ClassStage, StageContext
 from .options import Selection, code_option, keep_option
 from .points import Points, class_counts
 
-#: Class codes of vegetation: leaves beside a deck are as high as the deck, and keep their class.
-_VEGETATION = (3, 4, 5)
+#: Class codes that are kept: leaves, wires and towers beside a deck are as high as the deck.
+_BESIDE = (3, 4, 5, WIRE, TOWER)
 
 
 class Bridges(ClassStage):
@@ -46,7 +46,7 @@ class Bridges(ClassStage):
         ignored, ground = points.ignored(self.ignore), points.dimension("Ground") != 0
         before = points.class_codes
         free = points.inside & ~ignored & ~points.chosen(self.keep)
-        deck = find_decks(*points.axes, ~ignored, ground) & free & ~np.isin(before, _VEGETATION)
+        deck = find_decks(*points.axes, ~ignored, ground) & free & ~np.isin(before, _BESIDE)
         codes = before.copy()
         codes[deck] = self.code
         figures = points.report.figures

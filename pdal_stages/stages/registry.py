@@ -22,6 +22,11 @@ from .base import Stage
 ENTRY_POINTS = "pdal_stages.stages"
 #: Options of every PDAL stage, which PDAL handles itself.
 PDAL_OWN = ("tag", "inputs", "user_data", "log")
+#: Type name of a stage of earlier releases -> what to do without it.
+_REMOVED = {
+    "filters.wires": "Leave the stage out: filters.modelclassifier gives wires class 14, with the "
+    "model 'standard' or one that was trained on wires",
+}
 _TYPE_LINE = re.compile(r'^    type = "((?:filters|writers)\.\w+)"$', re.MULTILINE)
 
 
@@ -92,9 +97,18 @@ def stage_types() -> Mapping[str, type[Stage]]:
     return _STAGES
 
 
+def refuse_removed(name: str, where: str | None = None) -> None:
+    """Raise a PipelineError for a stage that earlier releases had."""
+    if name in _REMOVED:
+        raise PipelineError(
+            f"the stage '{name}' is no longer in pdal_stages", where=where, cure=_REMOVED[name]
+        )
+
+
 def stage_type(name: str) -> type[Stage]:
     """Return the stage of a type name; an error names the nearest one."""
     if name not in _STAGES:
+        refuse_removed(name)
         raise PipelineError(
             f"there is no stage '{name}' in pdal_stages",
             cure=f"{suggest(name, _STAGES)}Stages: {', '.join(_STAGES)}",

@@ -1,1 +1,1 @@
-"""Detect bridge decks and wires by shape, each in a module with its thresholds."""
+"""Detect bridge decks by shape, with its thresholds."""

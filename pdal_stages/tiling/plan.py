@@ -27,8 +27,8 @@ INPUT = "PdalStagesInput"
 #: Meters outside the tile; negative inside.
 OUTSIDE = "PdalStagesOutside"
 #: Meters; stages that look farther see saved results of the stages before them, which would
-#: otherwise be computed again in a wide halo. The shipped model looks 48, wires 84,
-#: bridges 367; between 48 and 84 the value was not tuned.
+#: otherwise be computed again in a wide halo. The shipped model looks 48, bridges 367; in between
+#: the value was not tuned.
 _FAR_M = 64.0
 # A filter of PDAL that neither list has, such as one that a later version adds, is taken to look
 # at neighbors: it needs --buffer.

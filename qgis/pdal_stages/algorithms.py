@@ -88,10 +88,7 @@ class _Showing(Algorithm):
 
 class _Classifying(_Showing):
     command = "classify"
-    listed = (
-        *("dimensions", "noise", "bridges", "wires"),
-        *("vegetation_heights", "polygons", "where"),
-    )
+    listed = (*("dimensions", "noise", "bridges", "vegetation_heights", "polygons", "where"),)
 
     def add_model(self):
         name = self.forms["models"][0] if self.forms["models"] else ""
