@@ -287,7 +287,7 @@ def test_parameters_are_the_commands_own(session, capsys):
         if argument["name"] in ("where", "memory", "workers", "polygons", "per"):
             assert shown[argument["name"].upper()][3] == argument["help"]
     assert shown["PER"][1] and not shown["MEMORY"][1]  # advanced, and not
-    for name in ("BRIDGES", "WIRES", "VEGETATION_HEIGHTS"):
+    for name in ("BRIDGES", "VEGETATION_HEIGHTS"):
         assert name in shown and not shown[name][1]
     heights = session("parameters", "heights")["parameters"]
     assert heights["WINDOW"][2] == "18.0" and heights["WINDOW"][3].startswith(
@@ -336,7 +336,7 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     assert "% known" in output and len(list((out / "rasters").glob("*.tif"))) == 3
     algorithm("report", INPUTS=cloud, PAGE=out / "report.html", DENSITY=2)
     assert "Signature" in (out / "report.html").read_text()
-    assert " buildings, " in algorithm("objects", INPUTS=cloud, OUTPUT=out / "o.gpkg")
+    assert "1 building, " in algorithm("objects", INPUTS=cloud, OUTPUT=out / "o.gpkg")
     shown = session(
         "styles", out / "o.gpkg", out / "t.tif", heights.with_suffix(".tif"), out / "c.tif"
     )
