@@ -26,7 +26,7 @@ def _bytes(kinds) -> int:
 
 
 def corpus() -> dict[str, LasFile]:
-    """Return all files by name, each 100 m from the one before."""
+    """Return all files by name, each farther from the one before than a model looks."""
     files = {
         f"v{minor}f{kind}{'z' * packed}": LasFile(minor, kind, compressed=packed)
         for minor, kinds in FORMATS.items()
@@ -69,7 +69,7 @@ def corpus() -> dict[str, LasFile]:
     }  # fmt: skip
     files |= more
     for number, file in enumerate(files.values()):
-        file.at, file.seed = 100.0 * number, number
+        file.at, file.seed = 400.0 * number, number
     return files
 
 
