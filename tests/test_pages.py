@@ -90,7 +90,7 @@ def folder(town, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_commands_run_as_printed(page, folder, environment, capsys):  # noqa: F811
+def test_commands_run_as_printed(page, folder, environment, capsys, pdal_program):  # noqa: F811
     lines = [*commands(page)]
     assert len(lines) == PAGES[page], lines
     if page in ("docs/objects.md", "docs/deliverables.md"):
@@ -102,6 +102,7 @@ def test_commands_run_as_printed(page, folder, environment, capsys):  # noqa: F8
         Path("classify.json").write_text(json.dumps(stages))
     for words in lines:
         if words[0] == "pdal":
+            words[0] = str(pdal_program)
             done = subprocess.run(words, env=environment, capture_output=True, text=True)
             assert done.returncode == 0, (words, done.stderr)
             continue

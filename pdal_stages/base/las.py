@@ -96,12 +96,6 @@ def header_there(path: str | os.PathLike) -> LasHeader | None:
         return None
 
 
-def holds_flags(path: str | os.PathLike) -> bool:
-    """Return whether flags share a byte with the class in a file, as in point formats 0 to 5."""
-    header = read_header(path)
-    return header is not None and header.point_format <= 5
-
-
 def source_id(path: str | os.PathLike) -> int:
     """Return the file source id of a LAS file, which LAS 1.0 has not."""
     with open(path, "rb") as file:

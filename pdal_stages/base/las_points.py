@@ -403,11 +403,6 @@ class LasColumns(Mapping[str, NDArray]):
             at += len(records)
         self._read |= new
 
-    def forget(self, names: Iterable[str]) -> None:
-        """Free the memory of dimensions; they are read again if they are asked for."""
-        for name in names:
-            self._read.pop(name, None)
-
     def __iter__(self) -> Iterator[str]:
         """Yield the names."""
         return iter(self.layout.names)

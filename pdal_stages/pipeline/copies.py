@@ -135,13 +135,13 @@ def write_copy(copy: LasCopy, target: Path, values: Mapping[str, NDArray]) -> No
 
 
 #: PDAL's names of types that are not NumPy's.
-_FLOATS = {"float64": "double", "float32": "float"}
+FLOATS = {"float64": "double", "float32": "float"}
 
 
 def named_types(layout: Layout) -> dict[str, str]:
     """Return the extra dimensions of a file with PDAL's names of their types."""
     kinds = {name: layout.type_of(name).name for name in layout.own}
-    return {name: _FLOATS.get(kind, kind) for name, kind in kinds.items()}
+    return {name: FLOATS.get(kind, kind) for name, kind in kinds.items()}
 
 
 def extra_dims_option(layout: Layout | None, added: Mapping[str, str]) -> str:

@@ -17,7 +17,7 @@ from ..base.files import whole_files
 from ..base.las_check import check_complete
 from ..base.las_copy import LasCopy
 from ..base.las_points import Layout, read_records
-from ..pipeline.copies import copy_of, named_types
+from ..pipeline.copies import FLOATS, copy_of, named_types
 from ..pipeline.inputs_outputs import LAS_WRITERS
 from ..pipeline.run import execute_whole
 from ..stages.points import class_counts
@@ -26,10 +26,6 @@ from .jobs import load_arrays, written
 from .options import MOST_AT_ONCE
 from .plan import TilePlan
 from .sorted_points import Piece
-
-#: PDAL's type names that are not NumPy's plus ``_t``.
-_FLOATS = {"float64": "double", "float32": "float"}
-
 
 # ---- results of tiles ----------------------------------------------------------------------------
 
@@ -195,7 +191,7 @@ def _copy(
     """Return a copy of an input with the dimensions of a plan; `types` are those of new values."""
     added = dict(plan.makes if plan.extra_dims is None else plan.extra_dims)
     if plan.creates is None:  # PDAL's filters may have made others, in between
-        named = {name: _FLOATS.get(kind.name, f"{kind.name}_t") for name, kind in types.items()}
+        named = {name: FLOATS.get(kind.name, f"{kind.name}_t") for name, kind in types.items()}
         added = {name: kind for name, kind in named.items() if name not in layout.names} | added
     added.pop("Classification", None)
     return copy_of(source.path, layout, target, added, source.reader)
