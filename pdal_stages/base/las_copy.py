@@ -132,9 +132,8 @@ class LasCopy:
         room = self.layout.header.point_bytes - _plain_bytes(self.layout)
         missing = room - sum(map(size_of_entry, entries))
         most = MOST_ENTRIES - len(entries) - len(self.added)
-        while (
-            missing > 0
-        ):  # of bytes that nobody describes: one by one, or three where they are many
+        # Bytes that nobody describes: one by one, or three by three where they are many.
+        while missing > 0:
             triple = missing >= 3 and missing > most
             entries.append(_entry(f"undescribed{missing}", 21 if triple else 1))
             missing, most = missing - (3 if triple else 1), most - 1
@@ -204,9 +203,10 @@ class LasCopy:
     def write(self, part: NDArray, values: Mapping[str, NDArray]) -> None:
         """Write records (n,) of the input with new values (n,) of Classification and others."""
         part = part.copy()
+        if "Classification" in values:
+            self._check_codes(values["Classification"])
         for name, column in values.items():
             if name in self.layout.names and name not in self.replaced:
-                self._check_codes(name, column)
                 self.layout.put(part, name, column)
         old = bytes_of(part)
         new = np.zeros((len(part), self.point_bytes), np.uint8)
@@ -227,10 +227,10 @@ class LasCopy:
             self._encoder.compress_many(new.reshape(-1))
         self.count += len(new)
 
-    def _check_codes(self, name: str, codes: NDArray) -> None:
+    def _check_codes(self, codes: NDArray) -> None:
         """Refuse classes that have no room beside the flags of formats 0 to 5."""
         largest = codes.max(initial=0)
-        if name == "Classification" and self.layout.is_old and largest > LEGACY_LIMIT:
+        if self.layout.is_old and largest > LEGACY_LIMIT:
             raise OptionError(
                 f"class codes above {LEGACY_LIMIT} do not fit the file, which is of LAS 1.0-1.3",
                 where=self.source,

@@ -36,8 +36,10 @@ def classify_file(
     The pipeline's reports and metadata are those of the run afterwards.
     """
     writes = writes_las(pipeline.source.stages[-1])
-    pipeline.check_inputs(pdal=not pipeline.copied)
-    layout = Layout.of(source) if is_las(source) else None
+    layout = None
+    if is_las(source):  # others are checked when the pipeline is run
+        pipeline.check_inputs(pdal=not pipeline.copied)
+        layout = Layout.of(source)
     if layout is not None and pipeline.is_read_here and writes:
         return _copy(pipeline, request, layout)
     if writes:

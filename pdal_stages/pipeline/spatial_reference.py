@@ -140,10 +140,8 @@ def reference_of_las(path: str) -> tuple[str, str]:
     held = projection_records(path)
     text = next((plain for number, data in held if number == _WKT and (plain := _text(data))), "")
     keys = [(number, data) for number, data in held if number in _KEYS]
-    if not any(
-        number == _KEYS[0] and len(data) > 8 for number, data in keys
-    ):  # a directory of none
-        keys = []
+    if not any(number == _KEYS[0] and len(data) > 8 for number, data in keys):
+        keys = []  # a directory of none
     if text and not _is_whole(text) and not described(text)[0]:
         raise _broken(text[:60])
     if not (text and keys):
