@@ -22,7 +22,7 @@ MAX_CLASSES = 256
 CHUNK = 1 << 20
 
 
-def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
+def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray:
     """Return labels as an (n,) uint16 array; StageError, which calls them `what`, for others."""
     a = np.asarray(labels)
     if a.ndim != 1:
@@ -43,9 +43,7 @@ def as_codes(labels: npt.ArrayLike, what: str) -> npt.NDArray[Any]:
     return a.astype(np.uint16, copy=False)
 
 
-def refuse_other_lengths(
-    reference: npt.NDArray[Any], others: Mapping[str, npt.NDArray[Any]]
-) -> None:
+def refuse_other_lengths(reference: npt.NDArray, others: Mapping[str, npt.NDArray]) -> None:
     """Raise StageError for an array, by its name, that is not as long as the reference."""
     for what, values in others.items():
         if len(values) != len(reference):
@@ -152,7 +150,7 @@ class ComparedClasses:
 
 
 def pair_counts(
-    reference: npt.NDArray[Any], predicted: npt.NDArray[Any]
+    reference: npt.NDArray, predicted: npt.NDArray
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Count pairs of labels.
 

@@ -31,6 +31,7 @@ import numpy.typing as npt
 
 from ..base.asprs import class_name
 from ..base.errors import StageError
+from ..base.json_types import JsonObject
 from .labels import (
     MAX_LABEL,
     ComparedClasses,
@@ -100,7 +101,7 @@ class ReliabilityHistogram:
         """Mean reliability of all points, None without points."""
         return float(self.total.sum() / self.points) if self.points else None
 
-    def curve(self) -> list[dict[str, Any]]:
+    def curve(self) -> list[JsonObject]:
         """Return the bins with points: the reliability curve (reliability against share right)."""
         return [
             {
@@ -122,7 +123,7 @@ class ReliabilityHistogram:
         error = sum(b["points"] * abs(b["mean"] - b["share_right"]) for b in bins)
         return float(error / self.points) if bins else None
 
-    def to_dict(self) -> dict[str, Any] | None:
+    def to_dict(self) -> JsonObject | None:
         """Return measures as JSON types; None without points."""
         if not self.points:
             return None
@@ -350,14 +351,14 @@ class Accuracy:
         pairs = zip(i[order], j[order], strict=True)
         return [(self.classes[a], self.columns[b], int(wrong[a, b])) for a, b in pairs]
 
-    def merge(self, codes: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def merge(self, codes: npt.NDArray) -> npt.NDArray:
         """Return codes (n,) with those that were merged as the code that they count as."""
         target_of = np.arange(MAX_LABEL + 1)
         target_of[list(self.merged)] = list(self.merged.values())
         return target_of[codes]
 
     def verdicts(
-        self, reference: npt.NDArray[Any], predicted: npt.NDArray[Any]
+        self, reference: npt.NDArray, predicted: npt.NDArray
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
         """Return which points were compared, and which are wrong, of codes (n,) before merging."""
         true = self.merge(reference)
@@ -368,10 +369,10 @@ class Accuracy:
         """Return the name of a class."""
         return self.names.get(code) or class_name(code)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return everything as JSON types; ``accuracy-1.json`` describes it."""
 
-        def described(codes: Iterable[int]) -> list[dict[str, Any]]:
+        def described(codes: Iterable[int]) -> list[JsonObject]:
             return [{"code": c, "name": self.name(c)} for c in codes]
 
         return {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
+
+from ..base.json_types import JsonObject
 
 #: Measures of the tables of several files.
 _MAIN = ("overall_accuracy", "kappa", "mean_f1")
@@ -14,7 +16,7 @@ def percent(share: float | None, digits: int = 2) -> str:
     return "-" if share is None else f"{100 * share:.{digits}f}"
 
 
-def summary(accuracy: Any) -> dict[str, Any]:
+def summary(accuracy: Any) -> JsonObject:
     """Return the main measures of an ``Accuracy``, None without points."""
     shares = {name: getattr(accuracy, name) if accuracy.points else None for name in _MAIN}
     return {"points": accuracy.points, **shares}
@@ -32,7 +34,7 @@ def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
     return _aligned(header, lines) + "\n"
 
 
-def table(figures: Mapping[str, Any], name: Callable[[int], str]) -> str:
+def table(figures: JsonObject, name: Callable[[int], str]) -> str:
     """Return the measures of ``Accuracy.to_dict`` as aligned text, in percent."""
     blocks = [_headline(figures, name), _classes(figures), _confusion(figures["confusion"])]
     if rated := figures["reliability"]:
@@ -41,7 +43,7 @@ def table(figures: Mapping[str, Any], name: Callable[[int], str]) -> str:
     return "\n\n".join(blocks)
 
 
-def _headline(d: Mapping[str, Any], name: Callable[[int], str]) -> str:
+def _headline(d: JsonObject, name: Callable[[int], str]) -> str:
     lines = [f"{'Points compared':<22}{d['points']:>14,}"]
     for key, label in (
         ("overall_accuracy", "Overall accuracy"),
@@ -69,7 +71,7 @@ def _headline(d: Mapping[str, Any], name: Callable[[int], str]) -> str:
     return "\n".join(lines)
 
 
-def _classes(d: Mapping[str, Any]) -> str:
+def _classes(d: JsonObject) -> str:
     header = ["", "Class", "Reference", "Predicted", "Recall %", "Precision %", "F1 %", "IoU %"]
     rows = [
         [str(f["code"]), f["name"], f"{f['support']:,}", f"{f['predicted']:,}"]
@@ -79,7 +81,7 @@ def _classes(d: Mapping[str, Any]) -> str:
     return _aligned(header, rows)
 
 
-def _confusion(d: Mapping[str, Any]) -> str:
+def _confusion(d: JsonObject) -> str:
     known = len(d["rows"])
     header = [
         "",

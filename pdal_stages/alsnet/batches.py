@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -92,7 +91,7 @@ class Batches:
         xyz: npt.NDArray[np.float64],
         points: int,
         spacing: float,
-        inputs: npt.NDArray[Any] | None = None,
+        inputs: npt.NDArray | None = None,
         reach: float = REACH,
     ) -> None:
         if not spacing > 0.0:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.json_types import JsonObject
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.input_dimensions import add_surroundings, take_dimensions
 from ..classifier.interface import ArrayRule, Block, InputPlan, PredictRequest
@@ -51,7 +52,7 @@ class AlsNet:
 
     @classmethod
     def from_file(
-        cls, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+        cls, entry: JsonObject, arrays: Mapping[str, npt.NDArray], codes: Sequence[int]
     ) -> AlsNet:
         """Return the network that a pass of a manifest describes; ModelError for contradictions."""
         names, parameters = entry["feature_names"], entry["parameters"]
@@ -76,7 +77,7 @@ class AlsNet:
         """Return the weights, which a model file stores."""
         return dict(self.weights)
 
-    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+    def to_file(self, codes: Sequence[int]) -> JsonObject:
         """Return what a manifest says of it beside its arrays."""
         return {
             "parameters": {

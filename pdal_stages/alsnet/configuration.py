@@ -17,6 +17,7 @@ from typing import Any
 
 from ..base import checks
 from ..base.errors import OptionError
+from ..base.json_types import JsonObject
 from ..base.options import Settings, setting
 
 #: Farthest point a batch takes by default, in spacings. A batch of full size in even density has
@@ -92,7 +93,7 @@ class Configuration:
             balls += centers * level.samples * 8.0
         return (4.0 * most + self.points * 200.0 + balls) / 2**20
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return plain data; :func:`parse_configuration` reads it."""
         return json.loads(json.dumps(asdict(self)))  # lists for tuples
 
@@ -172,7 +173,7 @@ class NetworkOptions(Settings):
         object.__setattr__(self, "configuration", parse_configuration(self.configuration))
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> NetworkOptions:
+    def from_dict(cls, values: JsonObject) -> NetworkOptions:
         """Return options by name; OptionError for an unknown name."""
         if not isinstance(values, Mapping):
             raise OptionError("'alsnet' must be a mapping of options", found=repr(values)[:60])

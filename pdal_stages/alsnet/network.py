@@ -39,7 +39,7 @@ def initial_weights(configuration: Configuration, inputs: int, classes: int, see
 
 
 def check_weights(
-    weights: Mapping[str, npt.NDArray[Any]], configuration: Configuration, inputs: int, classes: int
+    weights: Mapping[str, npt.NDArray], configuration: Configuration, inputs: int, classes: int
 ) -> None:
     """Raise a ModelError for arrays that do not fit a configuration.
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError
+from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.class_map import ClassMap
@@ -107,7 +108,7 @@ class NetworkTraining:
         self.optimizer = self.torch.optim.Adam(self.network.parameters(), lr=network.learning_rate)
         weight = class_weights(count, network.class_weights)
         self.weight = self.torch.tensor(weight, dtype=self.torch.float32, device=self.device)
-        self.curve: list[dict[str, Any]] = []  #: loss and scores of each epoch
+        self.curve: list[JsonObject] = []  #: loss and scores of each epoch
         self.best: Weights = self.network.dump()  #: weights of the epoch of the best mean F1
         self.best_epoch = 0
 
@@ -133,7 +134,7 @@ class NetworkTraining:
     def _run_epoch(self, bar: Progress) -> None:
         """Train one epoch, score it, and keep the weights where they are the best so far."""
         epoch = len(self.curve)
-        row: dict[str, Any] = {"epoch": epoch + 1, "loss": self._train_epoch(epoch, bar)}
+        row: JsonObject = {"epoch": epoch + 1, "loss": self._train_epoch(epoch, bar)}
         bar.label = f"training alsNet, epoch {epoch + 1}, loss {row['loss']:.3f}"
         if self.held_batches:
             row |= self._validate(bar)
@@ -143,7 +144,7 @@ class NetworkTraining:
         if first or _score(row) > _score(self._best_row()):
             self.best, self.best_epoch = self.network.dump(), epoch + 1
 
-    def _best_row(self) -> dict[str, Any]:
+    def _best_row(self) -> JsonObject:
         return self.curve[self.best_epoch - 1] if self.best_epoch else {}
 
     def _patience_is_over(self) -> bool:
@@ -213,7 +214,7 @@ class NetworkTraining:
         self.optimizer.step()
         return value
 
-    def _validate(self, bar: Progress) -> dict[str, Any]:
+    def _validate(self, bar: Progress) -> JsonObject:
         """Return the scores on the ground held out, by the sums of probabilities over batches."""
         data, torch = self.data, self.torch
         self.network.eval()
@@ -233,7 +234,7 @@ class NetworkTraining:
         np.add.at(matrix, (labels[rows], sums[rows].argmax(axis=1)), 1)
         return figures(matrix, data.labeled.classes.codes)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> JsonObject:
         """Return the manifest's entries: batches, epochs, curve, validation."""
         options, data = asdict(self.options), self.data
         for name in ("configuration", "start_from", "device"):
@@ -255,7 +256,7 @@ class NetworkTraining:
         }
 
 
-def _score(row: dict[str, Any]) -> float:
+def _score(row: JsonObject) -> float:
     return float(row["mean_f1"] or 0.0)
 
 

@@ -133,7 +133,7 @@ def join_clouds(
     return np.concatenate(out)
 
 
-def histogram_deviation(histogram: npt.NDArray[Any]) -> float:
+def histogram_deviation(histogram: npt.NDArray) -> float:
     """Return the standard deviation of a batch's class shares, in per cent [WM19 4.1].
 
     The deviation is large where nearly all points are of one class.
@@ -145,7 +145,7 @@ def histogram_deviation(histogram: npt.NDArray[Any]) -> float:
 
 
 def select_batches(
-    batches: Batches, labels: npt.NDArray[Any], n_classes: int, threshold: float
+    batches: Batches, labels: npt.NDArray, n_classes: int, threshold: float
 ) -> tuple[list[int], int]:
     """Return the numbers of batches with a variety of classes, and how many were added to them.
 
@@ -165,7 +165,7 @@ def select_batches(
 
 
 def hold_out(
-    xyz: npt.NDArray[np.float64], labels: npt.NDArray[Any], share: float, block_size: float
+    xyz: npt.NDArray[np.float64], labels: npt.NDArray, share: float, block_size: float
 ) -> npt.NDArray[np.bool_]:
     """Return which labeled points (not -1) lie in the blocks held out for validation.
 
@@ -195,7 +195,7 @@ def cover(batches: Batches, wanted: npt.NDArray[np.bool_]) -> list[int]:
     return sorted(out)
 
 
-def class_weights(count: npt.NDArray[Any], kind: str) -> npt.NDArray[np.float64]:
+def class_weights(count: npt.NDArray, kind: str) -> npt.NDArray[np.float64]:
     """Return the weight of each class in the loss; their mean over the points is 1."""
     share = count / count.sum()
     if kind == "none":

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from .errors import OptionError, suggest
+from .json_types import JsonObject
 
 
 def whole(
@@ -173,7 +174,7 @@ def _finite(word: str, kind: type = float) -> Any:
     return kind(word)
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, Any]]) -> JsonObject:
     out = dict(pairs)
     if len(out) != len(pairs):
         raise ValueError("duplicate key in one object")

@@ -14,13 +14,14 @@ import json
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from .checks import strict_json
 from .errors import StageError
 from .files import disk_is_full
+from .json_types import JsonObject, StageJson
 from .las import (
     POINT_BYTES,
     POINTWISE,
@@ -131,7 +132,7 @@ def beyond_box(path: str | os.PathLike, extent: tuple[float, float, float, float
 def check_complete(
     path: str | os.PathLike,
     name: str | os.PathLike,
-    writer: Mapping[str, Any],
+    writer: StageJson,
     count: int | None = None,
 ) -> None:
     """Refuse a file that was not written completely.
@@ -388,7 +389,7 @@ def check_copc(path: str | os.PathLike) -> None:
         ) from None
 
 
-def _is_rounded(dimension: dict[str, Any]) -> bool:
+def _is_rounded(dimension: JsonObject) -> bool:
     """Return whether a dimension is an axis of integers that stand for fractions.
 
     PDAL puts the scaled values back into integers.
@@ -398,7 +399,7 @@ def _is_rounded(dimension: dict[str, Any]) -> bool:
     return any(float(dimension.get(name) or 0) % 1 for name in ("scale", "offset"))
 
 
-def check_ept(path: str) -> dict[str, Any]:
+def check_ept(path: str) -> JsonObject:
     """Check an EPT source, ``ept.json``, against its files; return its description.
 
     One at an address is left to PDAL.

@@ -7,6 +7,8 @@ import sys
 from dataclasses import dataclass, field
 from typing import Any
 
+from .json_types import JsonObject
+
 #: Control characters, and those that change the direction of text, but for tabs and line breaks.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
@@ -66,7 +68,7 @@ class Report:
     """Counts, notes and warnings of a run."""
 
     #: JSON-able values by name, e.g. ``points`` or ``classes``
-    figures: dict[str, Any] = field(default_factory=dict)
+    figures: JsonObject = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  #: what the user should know; nothing is wrong
     warnings: list[str] = field(default_factory=list)  #: what is likely wrong, and the cure
     #: By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile
@@ -92,7 +94,7 @@ class Report:
         """Warnings, then notes."""
         return [*self.warnings, *self.notes]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the metadata: figures and, if any, ``beyond_halo``, ``warning`` and ``note``."""
         texts = {"warning": self.warnings, "note": self.notes}
         return (
@@ -102,7 +104,7 @@ class Report:
         )
 
 
-def _merge(target: dict[str, Any], source: dict[str, Any]) -> None:
+def _merge(target: JsonObject, source: JsonObject) -> None:
     for name, value in source.items():
         if isinstance(value, dict) and isinstance(target.get(name), dict):
             target[name] = {**value, **target[name]}

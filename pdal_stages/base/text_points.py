@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from .errors import StageError
+from .json_types import JsonObject
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 #: Lines that are converted at a time.
@@ -51,7 +52,7 @@ class TextPoints:
             decimals += 1
         self.decimals[axis] = decimals
 
-    def las_options(self) -> dict[str, Any]:
+    def las_options(self) -> JsonObject:
         """Return scales and offsets of ``writers.las`` that hold the coordinates exactly."""
         options: dict[str, Any] = {}
         for axis, decimals in self.decimals.items():

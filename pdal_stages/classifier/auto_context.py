@@ -155,7 +155,7 @@ class PassRun:
         self._shares = [np.zeros((n, len(each.codes)), np.uint16) for each in passes[: self._last]]
         self._features = _share_sources(read, request)
 
-    def blocks(self) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any]]]:
+    def blocks(self) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray]]:
         """Yield rows of the request's cloud with their probabilities, or columns of the context."""
         if not self._request.count:
             return
@@ -178,7 +178,7 @@ class PassRun:
 
     def _work(
         self, step: int, band: Band, held: dict[CloudFeatures, list[FeatureBlock]]
-    ) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any]]]:
+    ) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray]]:
         """Yield (rows, result of the step) for the rows of a band that the step must look at."""
         features, mask = self._features[step], self._wanted[step]
         rows = self._strips.rows(band[0])
@@ -241,16 +241,14 @@ class _StepOnBand:
     run: Run | None = None  #: that computes the features
     keep: bool = False  #: whether a later step needs the features
 
-    def compute(self, part: tuple[int, int]) -> tuple[FeatureBlock, npt.NDArray[Any]]:
+    def compute(self, part: tuple[int, int]) -> tuple[FeatureBlock, npt.NDArray]:
         """Return a block of features, with values if a later step needs them, and the result."""
         assert self.run is not None
         block = self.run.compute(part)
         result = self.result(block.rows, block.values)
         return (block if self.keep else block._replace(values=block.values[:0].copy())), result
 
-    def classify(
-        self, block: FeatureBlock
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any] | None]:
+    def classify(self, block: FeatureBlock) -> tuple[npt.NDArray[np.int64], npt.NDArray | None]:
         """Return the rows of a block that are wanted, and what the step makes of their features."""
         rows, values = block.rows, block.values
         if self.mask is not None:
@@ -260,7 +258,7 @@ class _StepOnBand:
 
     def result(
         self, rows: npt.NDArray[np.int64], values: npt.NDArray[np.float32] | None
-    ) -> npt.NDArray[Any]:
+    ) -> npt.NDArray:
         """Return shares (b, classes), probabilities or context columns of a block."""
         parts = [] if values is None else [values]
         if self.context is not None:

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.checks import strict_json
 from ..base.errors import ModelError, OptionError
+from ..base.json_types import JsonObject
 from ..base.messages import one_line
 
 #: Bins of reliability from 0 to 1; the last one holds 1. Model files hold so many counts, so
@@ -81,8 +82,8 @@ class Calibration:
 
     def add(
         self,
-        predicted: npt.NDArray[Any],
-        true: npt.NDArray[Any],
+        predicted: npt.NDArray,
+        true: npt.NDArray,
         reliability: npt.NDArray[np.floating],
         weight: npt.NDArray[np.floating] | None = None,
     ) -> None:
@@ -125,7 +126,7 @@ class Calibration:
         points = self.points(known)
         return sum(float(self.right[code].sum()) for code in known) / points if points else None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return plain values, for a manifest or a file."""
 
         def rounded(counts: npt.NDArray[np.float64]) -> list[float]:
@@ -138,7 +139,7 @@ class Calibration:
         return {"about": self.about, "classes": classes}
 
     @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Calibration:
+    def from_dict(cls, entry: JsonObject) -> Calibration:
         """Return the calibration that :meth:`to_dict` gave; ModelError for something else."""
         out = cls()
         try:
@@ -156,7 +157,7 @@ class Calibration:
         return out
 
 
-def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
+def read_calibration(info: JsonObject, path: str) -> Calibration:
     """Return a model's calibration from its manifest `info`, or from the file beside its `path`.
 
     Raises
@@ -183,9 +184,7 @@ def read_calibration(info: Mapping[str, Any], path: str) -> Calibration:
     )
 
 
-def calibrate_on_base(
-    refined: Mapping[str, Any], base: Mapping[str, Any], path: str
-) -> Mapping[str, Any]:
+def calibrate_on_base(refined: JsonObject, base: JsonObject, path: str) -> JsonObject:
     """Return the calibration of a model whose labels are a person's corrections of its base.
 
     Corrections lie where the base was worst. So the counts of the `refined` model are taken for new

@@ -92,7 +92,7 @@ class ClassMap:
         both = sorted([(target, self.names[i], self.labels[i]), (BACKGROUND, "Background", rest)])
         return ClassMap(*zip(*both, strict=True))
 
-    def index(self, labels: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
+    def index(self, labels: npt.NDArray) -> npt.NDArray[np.int16]:
         """Return (n,) int16: the position of each label's class, -1 where it is dropped."""
         labels = np.asarray(labels)
         highest = max((label for part in self.labels for label in part), default=0)

@@ -15,7 +15,6 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -197,13 +196,13 @@ class CellContext:
     shares: npt.NDArray[np.uint16]  #: (n, classes) of the points themselves
     #: of the tokens that have cells: (n,) the cell of each point, (cells, classes) the means around
     #: each cell
-    cells: Mapping[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]]
+    cells: Mapping[str, tuple[npt.NDArray, npt.NDArray]]
     #: of the tokens of segments and lines
     described: Mapping[str, SegmentContext | LineContext]
 
     def columns(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """Return the columns (b, columns) of some of the points, token by token."""
-        parts: list[npt.NDArray[Any]] = []
+        parts: list[npt.NDArray] = []
         for token in self.tokens:
             if token == OWN:
                 parts.append(self.shares[rows] / WHOLE)
@@ -215,7 +214,7 @@ class CellContext:
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
-def count_shares(probabilities: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
+def count_shares(probabilities: npt.NDArray) -> npt.NDArray[np.uint16]:
     """Return probabilities (n, classes) in 65535ths."""
     return np.rint(np.asarray(probabilities) * WHOLE).astype(np.uint16)
 

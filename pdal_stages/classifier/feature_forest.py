@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.engine import FeatureBlock, Run
@@ -43,7 +44,7 @@ class Features:
             if part.neighborhood.kind == "copt" and self.copt_threshold is None:
                 raise ModelError("the model lacks the curvature threshold of copt")
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return what a manifest stores beside the names of the columns."""
         plan = self.plan.to_dict()
         del plan["features"], plan["dimensions"]
@@ -55,7 +56,7 @@ class Features:
         }
 
     @classmethod
-    def from_dict(cls, entry: Mapping[str, Any], names: Sequence[str]) -> Features:
+    def from_dict(cls, entry: JsonObject, names: Sequence[str]) -> Features:
         """Return the features of a manifest's pass; `names` are those of the columns, in order."""
         bins = entry["shape_bins"]
         return cls(
@@ -119,7 +120,7 @@ class CloudFeatures:
         report.beyond_halo.update(computed.beyond_halo)
         report.reach = max(report.reach, computed.reach)
 
-    def _take(self, rows: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[Any]]:
+    def _take(self, rows: npt.NDArray[np.int64]) -> dict[str, npt.NDArray]:
         names = self.features.plan.dimensions
         return take_dimensions(names, self._dimensions, len(self._request.xyz), rows)
 
@@ -138,7 +139,7 @@ class Blend:
     trusted: float = 1.0
 
     @classmethod
-    def from_dict(cls, entry: Mapping[str, Any], codes: Sequence[int]) -> Blend:
+    def from_dict(cls, entry: JsonObject, codes: Sequence[int]) -> Blend:
         """Return the blend that a manifest describes for a pass whose classes are `codes`.
 
         ModelError where its classes contradict each other.
@@ -149,7 +150,7 @@ class Blend:
             raise ModelError("classes of a refined forest do not fit", found=str(entry)[:100])
         return blend
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the entry of a manifest."""
         classes = {"before": list(self.before), "labeled": list(self.labeled)}
         return {**classes, "trusted": self.trusted}
@@ -233,8 +234,8 @@ class FeatureForest:
     @classmethod
     def from_file(
         cls,
-        entry: Mapping[str, Any],
-        arrays: Mapping[str, npt.NDArray[Any]],
+        entry: JsonObject,
+        arrays: Mapping[str, npt.NDArray],
         codes: Sequence[int],
         learner: type[Learner],
     ) -> FeatureForest:
@@ -262,7 +263,7 @@ class FeatureForest:
         kind = FOREST if blend is not None else entry["algorithm"]
         return cls(features, forest, context, blend, kind)
 
-    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+    def to_file(self, codes: Sequence[int]) -> JsonObject:
         """Return what a manifest says of it beside its arrays."""
         blend = {} if self.blend is None else self.blend.to_dict()
         return {
@@ -273,7 +274,7 @@ class FeatureForest:
             **self.features.to_dict(),
         }
 
-    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+    def arrays(self) -> Mapping[str, npt.NDArray]:
         """Return the arrays that a model file stores."""
         return self.forest.arrays()
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
+from ..base.json_types import JsonObject
 from .interface import ArrayRule, Trainer
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class FeatureKind:
         return FeatureTrainer(self.name, self.load())
 
     def from_file(
-        self, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+        self, entry: JsonObject, arrays: Mapping[str, npt.NDArray], codes: Sequence[int]
     ) -> FeatureForest:
         """Return the pass of a manifest; ModelError where the entry contradicts itself."""
         from .feature_forest import FeatureForest

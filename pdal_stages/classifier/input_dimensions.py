@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -57,7 +56,7 @@ def list_values(
     n: int,
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
-) -> list[npt.NDArray[Any]]:
+) -> list[npt.NDArray]:
     """Return the values (n,) of the dimensions that features use.
 
     Optional ones may be missing. Values are checked at `rows`, as by :func:`take_dimensions`.
@@ -92,7 +91,7 @@ def take_dimensions(
     n: int,
     rows: npt.NDArray[np.int64] | None = None,
     where: str | None = None,
-) -> dict[str, npt.NDArray[Any]]:
+) -> dict[str, npt.NDArray]:
     """Return by name, but for coordinates, the dimensions at some rows of a cloud of n points.
 
     Parameters

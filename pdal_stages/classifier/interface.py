@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.json_types import JsonObject, StageJson
 from ..base.messages import Report
 from ..base.progress import Progress
 
@@ -109,10 +110,10 @@ class Estimator(Protocol):
     def context(self) -> Context | None:
         """What it reads of the pass before."""
 
-    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+    def arrays(self) -> Mapping[str, npt.NDArray]:
         """Return the arrays that a model file stores."""
 
-    def to_file(self, codes: Sequence[int]) -> dict[str, Any]:
+    def to_file(self, codes: Sequence[int]) -> JsonObject:
         """Return what a manifest says of it beside its arrays, where its classes are `codes`."""
 
 
@@ -163,7 +164,7 @@ class EstimatorKind(Protocol):
         """What trains it."""
 
     def from_file(
-        self, entry: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]], codes: Sequence[int]
+        self, entry: JsonObject, arrays: Mapping[str, npt.NDArray], codes: Sequence[int]
     ) -> Estimator:
         """Return the estimator that a pass of a manifest describes, with classes `codes`.
 
@@ -174,23 +175,23 @@ class EstimatorKind(Protocol):
 class Preprocessing(Protocol):
     """What knows the stages that compute a model's dimensions (``preparation``)."""
 
-    def check(self, preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    def check(self, preparation: Sequence[StageJson]) -> list[StageJson]:
         """Return the stages in one spelling; ModelError for one that no model may have."""
 
-    def algorithm_versions(self, preparation: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    def algorithm_versions(self, preparation: Iterable[StageJson]) -> dict[str, int]:
         """Return the version of each stage's algorithm in this release."""
 
-    def preparation_of(self, names: Iterable[str]) -> list[dict[str, Any]]:
+    def preparation_of(self, names: Iterable[str]) -> list[StageJson]:
         """Return the stages that compute these dimensions, as far as they are heights."""
 
     def made_of_coordinates(
         self,
-        preparation: Sequence[Mapping[str, Any]],
+        preparation: Sequence[StageJson],
         xyz: npt.NDArray[np.float64],
         usable: npt.NDArray[np.bool_] | None = None,
         threads: int | None = None,
         classes: npt.NDArray[np.uint8] | None = None,
-    ) -> dict[str, npt.NDArray[Any]]:
+    ) -> dict[str, npt.NDArray]:
         """Return the dimensions (n,) that the stages compute from coordinates (n, 3) in meters."""
 
 

@@ -8,11 +8,12 @@ cross-validation and calibration as the forest does, and is applied in tiles lik
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import ClassVar, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from .interface import ArrayRule
 from .training_options import TrainingOptions
@@ -30,7 +31,7 @@ class Learner(Protocol):
     def fit(
         cls: type[_Learner],
         values: npt.NDArray[np.float32],
-        label: npt.NDArray[Any],
+        label: npt.NDArray,
         weight: npt.NDArray[np.int64],
         trees: int | Sequence[int],
         options: TrainingOptions,
@@ -53,14 +54,14 @@ class Learner(Protocol):
 
     @classmethod
     def from_arrays(
-        cls: type[_Learner], arrays: Mapping[str, npt.NDArray[Any]], n_features: int, n_classes: int
+        cls: type[_Learner], arrays: Mapping[str, npt.NDArray], n_features: int, n_classes: int
     ) -> _Learner:
         """Return the learner of a model file's arrays; ModelError unless all of them fit."""
 
-    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+    def arrays(self) -> Mapping[str, npt.NDArray]:
         """Return the arrays that a model file stores."""
 
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> JsonObject:
         """Return what a manifest says of it beside its arrays, such as its size."""
 
     def predict_proba(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError, suggest
+from ..base.json_types import JsonObject, StageJson
 from ..base.messages import Report
 from ..base.progress import Progress
 from ..features import FeaturePlan
@@ -57,7 +58,7 @@ class Model:
     passes: tuple[Estimator, ...]
     classes: list[tuple[int, str]]  #: code and name, in the order of the columns of probabilities
     #: the rest of the manifest: how it was trained, scores, by pass its importances
-    info: dict[str, Any] = field(default_factory=dict)
+    info: JsonObject = field(default_factory=dict)
 
     @property
     def algorithm(self) -> Estimator:
@@ -104,7 +105,7 @@ class Model:
         return optional_dimensions(self.plan.dimensions)
 
     @property
-    def preparation(self) -> list[dict[str, Any]]:
+    def preparation(self) -> list[StageJson]:
         """Stages that computed the training's dimensions; empty where none can be stored."""
         return self.info["preparation"]
 
@@ -138,7 +139,7 @@ class Model:
         features = {} if self.gives_variance else {"filters.multiscalefeatures": ALGORITHM_VERSION}
         return preprocessing().algorithm_versions(self.preparation) | features
 
-    def record_preprocessing(self, preparation: Sequence[Mapping[str, Any]]) -> None:
+    def record_preprocessing(self, preparation: Sequence[StageJson]) -> None:
         """Store the stages that computed the training's dimensions, and their versions."""
         self.info["preparation"] = [dict(stage) for stage in preparation]
         self.info["algorithms"] = self.algorithm_versions
@@ -178,7 +179,7 @@ class Model:
         """Return a page of text about the model."""
         return model_description.text(self)
 
-    def manifest(self) -> dict[str, Any]:
+    def manifest(self) -> JsonObject:
         """Return what the model file holds beside arrays, as plain data."""
         entries = zip(self.passes, self.codes_of, self.info["passes"], strict=True)
         passes = [
@@ -295,7 +296,7 @@ class Model:
         self,
         work: WorkingCloud,
         request: PredictRequest,
-        columns: dict[str, npt.NDArray[Any]],
+        columns: dict[str, npt.NDArray],
         progress: Progress | None,
     ) -> None:
         """Fill the columns (n, ...) of all points of the cloud, block by block.
@@ -367,7 +368,7 @@ def _loaded(path: str, *stamp: int) -> Model:
     return load_model(path)
 
 
-def assemble(manifest: dict[str, Any], arrays: model_file.Arrays) -> Model:
+def assemble(manifest: JsonObject, arrays: model_file.Arrays) -> Model:
     """Return the model of a manifest and arrays; ModelError where they contradict each other."""
     classes = [(entry["code"], entry["name"]) for entry in manifest["classes"]]
     codes = [code for code, _ in classes]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+from ..base.json_types import JsonObject, StageJson
 from ..base.messages import one_line
 from .calibration import Calibration
 
@@ -20,7 +21,7 @@ class DescribedModel(Protocol):
     """What the text reads of a ``Model``."""
 
     @property
-    def info(self) -> Mapping[str, Any]:
+    def info(self) -> JsonObject:
         """The manifest without its passes."""
 
     @property
@@ -32,7 +33,7 @@ class DescribedModel(Protocol):
         """Dimensions that are used where a cloud has them."""
 
     @property
-    def preparation(self) -> Sequence[Mapping[str, Any]]:
+    def preparation(self) -> Sequence[StageJson]:
         """Stages that computed the training's dimensions."""
 
     @property
@@ -47,7 +48,7 @@ class DescribedModel(Protocol):
     def outdated(self) -> Sequence[str]:
         """Warnings about algorithms that have changed."""
 
-    def manifest(self) -> Mapping[str, Any]:
+    def manifest(self) -> JsonObject:
         """Return the manifest."""
 
     def importances(self, number: int = -1) -> Mapping[str, float]:
@@ -63,7 +64,7 @@ def text(model: DescribedModel) -> str:
     return "\n".join(map(one_line, [*lines, *_classes(info), ""]))
 
 
-def _measured(info: Mapping[str, Any]) -> _Rows:
+def _measured(info: JsonObject) -> _Rows:
     """Return the share of right points on ground that was held out, by the class given."""
     if not info.get("sureness"):
         return []
@@ -134,7 +135,7 @@ def _training(model: DescribedModel) -> _Rows:
     ]
 
 
-def _classes(info: Mapping[str, Any]) -> list[str]:
+def _classes(info: JsonObject) -> list[str]:
     """Return the table of classes."""
     lines = [f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 held out':>13}"]
     f1 = held_out(info).get("f1") or {}
@@ -152,14 +153,14 @@ def range_text(densities: Mapping[str, float]) -> str:
     return " to ".join(dict.fromkeys(f"{densities[end]:.3g}" for end in ("low", "high")))
 
 
-def held_out(info: Mapping[str, Any]) -> Mapping[str, Any]:
+def held_out(info: JsonObject) -> JsonObject:
     """Return the scores on held-out ground, of a forest by cross-validation; empty without any."""
     of_network = info["training"].get("held_out")
     crossed = info["accuracy"]["cross_validation"]
     return of_network if isinstance(of_network, dict) else crossed["chosen"] if crossed else {}
 
 
-def score(info: Mapping[str, Any]) -> str:
+def score(info: JsonObject) -> str:
     """Return the score in a line, or why there is none."""
     row = held_out(info)
     if not row and info.get("sureness"):

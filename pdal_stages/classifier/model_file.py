@@ -20,7 +20,6 @@ from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,10 +27,11 @@ import numpy.typing as npt
 from ..base.checks import strict_json
 from ..base.errors import ModelError, StageError
 from ..base.files import whole_files
+from ..base.json_types import JsonObject
 from .interface import ArrayRule
 
 #: Arrays of each pass by their names.
-Arrays = list[dict[str, npt.NDArray[Any]]]
+Arrays = list[dict[str, npt.NDArray]]
 
 #: Name of the shipped model that is used where none is named.
 STANDARD = "standard"
@@ -82,8 +82,8 @@ def digest_of(name: str) -> str:
 
 def write(
     path: str | os.PathLike,
-    manifest: Mapping[str, Any],
-    passes: Sequence[Mapping[str, npt.NDArray[Any]]],
+    manifest: JsonObject,
+    passes: Sequence[Mapping[str, npt.NDArray]],
 ) -> None:
     """Write a model file; an existing one stays as it was until the new one is complete.
 
@@ -118,7 +118,7 @@ def write(
             archive.writestr(info, data)
 
 
-def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
+def read(path: str | os.PathLike, rules_of) -> tuple[JsonObject, Arrays]:
     """Return the manifest of a model file, and the arrays of each pass.
 
     Parameters
@@ -150,7 +150,7 @@ def read(path: str | os.PathLike, rules_of) -> tuple[dict[str, Any], Arrays]:
 
 def _read(
     archive: zipfile.ZipFile, size: int, rules_of, is_shipped: bool
-) -> tuple[dict[str, Any], Arrays]:
+) -> tuple[JsonObject, Arrays]:
     members = {info.filename: info for info in archive.infolist()}
     if len(members) != len(archive.infolist()):
         raise ModelError("the model file has a member twice")
@@ -200,7 +200,7 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     return data
 
 
-def to_bytes(array: npt.NDArray[Any]) -> bytes:
+def to_bytes(array: npt.NDArray) -> bytes:
     """Return the array as ``.npy`` bytes (version 1.0, little-endian, C order)."""
     out = io.BytesIO()
     little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False)
@@ -208,7 +208,7 @@ def to_bytes(array: npt.NDArray[Any]) -> bytes:
     return out.getvalue()
 
 
-def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
+def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray:
     """Return the array in ``.npy`` bytes, a view of `data`; ModelError where it breaks `rule`.
 
     NumPy's reader is not used for the values because it allocates what a header says: here an
@@ -232,7 +232,7 @@ def from_bytes(data: bytes, rule: ArrayRule, name: str) -> npt.NDArray[Any]:
     return values.astype(dtype.newbyteorder("="), copy=False)
 
 
-def parse(data: bytes, is_shipped: bool = False) -> dict[str, Any]:
+def parse(data: bytes, is_shipped: bool = False) -> JsonObject:
     """Return the manifest in `data`, valid by its schema; a shipped one is not validated again."""
     try:
         manifest = strict_json(data.decode("utf-8"))
@@ -255,7 +255,7 @@ def parse(data: bytes, is_shipped: bool = False) -> dict[str, Any]:
     return manifest
 
 
-def validate(manifest: Mapping[str, Any]) -> None:
+def validate(manifest: JsonObject) -> None:
     """Raise a ModelError where a manifest does not follow its JSON Schema."""
     try:
         error = next(_validator().iter_errors(manifest), None)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..base.asprs import GROUND
 from ..base.errors import OptionError
+from ..base.json_types import JsonObject
 from ..base.messages import Report
 from ..base.options import Settings, setting
 from ..features.point_grid import CellGrid, build_grid
@@ -135,7 +135,7 @@ class PointRoles:
         return 0 if self.present is None else len(self.wanted) - len(self.present)
 
 
-def _column(name: str, values: npt.ArrayLike, n: int, dtype: type) -> npt.NDArray[Any]:
+def _column(name: str, values: npt.ArrayLike, n: int, dtype: type) -> npt.NDArray:
     """Return an argument as (n,) of a type; OptionError where its values do not fit."""
     array = np.asarray(values)
     same_kind = (array.dtype == np.bool_) == (dtype is np.bool_)
@@ -155,8 +155,8 @@ class WorkingCloud:
     #: rows in work that stand for points to classify, ascending; None: all
     wanted: npt.NDArray[np.int64] | None
     grid: CellGrid  #: the index of `xyz`
-    rows_in_cloud: npt.NDArray[Any]  #: (k,) of the points themselves
-    _order: npt.NDArray[Any]  #: (k,) place of each among the representatives
+    rows_in_cloud: npt.NDArray  #: (k,) of the points themselves
+    _order: npt.NDArray  #: (k,) place of each among the representatives
     _representatives: Representatives | None
 
     @classmethod
@@ -206,7 +206,7 @@ class WorkingCloud:
 
     def members(
         self, rows_in_work: npt.NDArray[np.int64]
-    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64] | slice]:
+    ) -> tuple[npt.NDArray, npt.NDArray[np.int64] | slice]:
         """Return the cloud's rows that a block stands for, and the block's row for each."""
         rows = self._order[rows_in_work]
         if self._representatives is None:
@@ -216,10 +216,10 @@ class WorkingCloud:
 
 def empty_columns(
     roles: PointRoles, classes: int, options: PredictionOptions
-) -> dict[str, npt.NDArray[Any]]:
+) -> dict[str, npt.NDArray]:
     """Return the columns (n, ...) of results before any point is classified."""
     n, current = len(roles.wanted), roles.current
-    columns: dict[str, npt.NDArray[Any]] = {
+    columns: dict[str, npt.NDArray] = {
         "classification": np.zeros(n, np.uint8) if current is None else current.copy(),
         "reliability": np.zeros(n, np.float32),
     }
@@ -235,7 +235,7 @@ def empty_columns(
 
 def decide(
     block: Block, codes: npt.NDArray[np.uint8], wanted: Iterable[str]
-) -> dict[str, npt.NDArray[Any]]:
+) -> dict[str, npt.NDArray]:
     """Return the wanted columns of a block; of classes that are equally likely the first wins.
 
     ``second`` is the class that would win without the winner, ``second_share`` its probability.
@@ -259,7 +259,7 @@ def decide(
     return columns
 
 
-def move_from_ground(columns: dict[str, npt.NDArray[Any]], roles: PointRoles) -> int:
+def move_from_ground(columns: dict[str, npt.NDArray], roles: PointRoles) -> int:
     """Give ground points that must not be ground their second class; return their number."""
     second, share = columns.pop("second"), columns.pop("second_share")
     rows = np.flatnonzero(roles.not_ground & (columns["classification"] == GROUND))
@@ -270,7 +270,7 @@ def move_from_ground(columns: dict[str, npt.NDArray[Any]], roles: PointRoles) ->
 
 
 def reject(
-    columns: dict[str, npt.NDArray[Any]], roles: PointRoles, options: PredictionOptions
+    columns: dict[str, npt.NDArray], roles: PointRoles, options: PredictionOptions
 ) -> npt.NDArray[np.int64]:
     """Take the class from points that are not reliable enough; return their rows in the cloud."""
     code = columns["classification"]
@@ -287,7 +287,7 @@ def reject(
 
 def count_classes(
     classification: npt.NDArray[np.uint8], roles: PointRoles, rejected: int
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the counts of a prediction, for its report."""
     n, wanted = len(roles.wanted), int(np.count_nonzero(roles.wanted))
     number = np.bincount(classification[roles.wanted], minlength=256)

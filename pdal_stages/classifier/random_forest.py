@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError
 from ..base.jit import njit
+from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from ..base.threads import map_blocks
 from .interface import ArrayRule
@@ -47,7 +48,7 @@ class Forest:
     """
 
     tree_sizes: npt.NDArray[np.int32]  #: (trees,) nodes of each tree
-    feature: npt.NDArray[Any]  #: (nodes,) int16 or int32: which a split node compares, -1 in a leaf
+    feature: npt.NDArray  #: (nodes,) int16 or int32: which a split node compares, -1 in a leaf
     #: (nodes,) a row goes to the left child where its value <= threshold; 0 in a leaf
     threshold: npt.NDArray[np.float32]
     #: (leaves, classes) training samples of each class in each leaf, leaves in the order of their
@@ -119,7 +120,7 @@ class Forest:
     def fit(
         cls,
         values: npt.NDArray[np.float32],
-        label: npt.NDArray[Any],
+        label: npt.NDArray,
         weight: npt.NDArray[np.int64],
         trees: int | Sequence[int],
         options: TrainingOptions,
@@ -130,7 +131,7 @@ class Forest:
 
     @classmethod
     def from_arrays(
-        cls, arrays: Mapping[str, npt.NDArray[Any]], n_features: int, n_classes: int
+        cls, arrays: Mapping[str, npt.NDArray], n_features: int, n_classes: int
     ) -> Forest:
         """Return the forest of a model file's arrays; everything about them is checked."""
         if arrays["leaf_counts"].shape[1] != n_classes:
@@ -141,11 +142,11 @@ class Forest:
         # copies: kernels are compiled once more for arrays that cannot be written
         return cls(**{name: np.array(arrays[name]) for name in cls.rules}, n_features=n_features)
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self) -> dict[str, npt.NDArray]:
         """Return the arrays that a model file stores."""
         return {name: getattr(self, name) for name in self.rules}
 
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> JsonObject:
         """Return what a manifest says about the forest beside its arrays."""
         return {
             "trees": self.n_trees,
@@ -233,7 +234,7 @@ def _laid_out(
     return np.where(split, 2 * before + 1, node).astype(np.uint32), depths
 
 
-def _level_order(tree) -> tuple[npt.NDArray[Any], npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+def _level_order(tree) -> tuple[npt.NDArray, npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
     """Return feature, threshold and leaf counts of a scikit-learn tree, level by level."""
     shares = tree.value[:, 0, :]
     # scikit-learn keeps shares (before 1.3: counts) and the weight of a node; bootstrap weights are
@@ -261,7 +262,7 @@ def float32_at_most(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
 
 def grow_forest(
     values: npt.NDArray[np.float32],
-    label: npt.NDArray[Any],
+    label: npt.NDArray,
     weight: npt.NDArray[np.int64],
     trees: int | Sequence[int],
     growth: TrainingOptions,
@@ -311,7 +312,7 @@ def grow_forest(
 
 def _grow_tree(
     values: npt.NDArray[np.float32],
-    label: npt.NDArray[Any],
+    label: npt.NDArray,
     weight: npt.NDArray[np.int64],
     growth: TrainingOptions,
     number: int,
@@ -335,7 +336,7 @@ def _grow_tree(
 
 
 def _share_right(
-    shares: npt.NDArray[np.float64], label: npt.NDArray[Any], weight: npt.NDArray[np.int64]
+    shares: npt.NDArray[np.float64], label: npt.NDArray, weight: npt.NDArray[np.int64]
 ) -> float:
     """Return the share of samples whose class (n,) has the largest sum of probabilities.
 

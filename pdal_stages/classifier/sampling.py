@@ -26,6 +26,7 @@ from ..accuracy.text import summary
 from ..base.errors import OptionError
 from ..base.grid import places_among
 from ..base.hashing import hash_rows
+from ..base.json_types import JsonObject
 from ..base.progress import Progress
 
 #: Side of a cell of the curve in meters (not tuned).
@@ -62,7 +63,7 @@ class Samples:
         at = at[np.argsort(self.row[at], kind="stable")]
         return at, self.row[at]
 
-    def take(self, array_of: Callable[[int], npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    def take(self, array_of: Callable[[int], npt.NDArray]) -> npt.NDArray:
         """Return the samples' values (m, ...) from an array of values for all points of each cloud.
 
         `array_of` returns the array of a cloud by its number, and is called for clouds with samples
@@ -148,7 +149,7 @@ def _keys_of_class(
     seed: int,
     share: float,
     progress: Progress | None,
-) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+) -> tuple[npt.NDArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Return keys (m,) of a share of a class's points in some clouds, their rows, and their clouds.
 
     A point stays or goes by the hash of its key.
@@ -202,7 +203,7 @@ def spread(
     return np.arange(n), weight
 
 
-def curve_keys(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray[Any]:
+def curve_keys(xyz: npt.NDArray[np.float64], seed: int) -> npt.NDArray:
     """Morton code of each point's cell in plan, and a hash of its coordinates and the seed."""
     # Anchored to absolute coordinates, so a larger extent changes nothing; 31 bits an axis hold
     # half a million kilometers either way.
@@ -244,8 +245,8 @@ class Folds:
     def of_blocks(
         cls,
         xy: npt.NDArray[np.float64],
-        label: npt.NDArray[Any],
-        weight: npt.NDArray[Any],
+        label: npt.NDArray,
+        weight: npt.NDArray,
         folds: int,
         side: float,
     ) -> Folds:
@@ -275,8 +276,8 @@ class Folds:
     def of_ground(
         cls,
         xy: npt.NDArray[np.float64],
-        label: npt.NDArray[Any],
-        weight: npt.NDArray[Any],
+        label: npt.NDArray,
+        weight: npt.NDArray,
         surveys: Sequence[str],
         folds: int,
     ) -> Folds:
@@ -315,7 +316,7 @@ def _numbers(xyz: npt.NDArray[np.float64], side: float) -> npt.NDArray[np.int64]
 
 
 def split(
-    xy: npt.NDArray[np.float64], fold: npt.NDArray[Any], number: int, gap: float
+    xy: npt.NDArray[np.float64], fold: npt.NDArray, number: int, gap: float
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
     """Return the training mask (n,) and the rows held out (m,) of one fold.
 
@@ -334,7 +335,7 @@ def split(
     return train, np.flatnonzero(held)
 
 
-def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> dict[str, Any]:
+def figures(matrix: npt.NDArray[np.int64], codes: Sequence[int]) -> JsonObject:
     """Return the measures kept in a model file; rows of the matrix are the truth."""
     accuracy = Accuracy.from_confusion(matrix, codes)
     measures = summary(accuracy)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError, OptionError
+from ..base.json_types import JsonObject
 from ..base.memory import free_memory
 from ..base.progress import Progress
 from ..features import FeaturePlan
@@ -263,7 +264,7 @@ class ForestTraining:
                     )
                 yield rows, self._grow(values, weight * train, self.fold_trees, bar)[0]
 
-    def _validate(self) -> tuple[dict[str, Any] | None, dict[str, str]]:
+    def _validate(self) -> tuple[JsonObject | None, dict[str, str]]:
         """Hold out surveys, or blocks of one survey: return the scores, or why there are none."""
         o, samples, codes = self.options, self.samples, self.codes
         if o.folds == 0:
@@ -374,7 +375,7 @@ class ForestTraining:
         columns = self.first[rows, self.values.shape[1] :]
         return self.context.own_probabilities(columns, len(self.base.classes))
 
-    def _held_by_base(self) -> dict[str, Any]:
+    def _held_by_base(self) -> JsonObject:
         """Return by new class the samples, and those that the base calls a class without labels.
 
         Points of classes without labels keep the class of the base.
@@ -413,8 +414,8 @@ def _join_columns(
 
 
 def describe_refinement(
-    base: Any, info: Mapping[str, Any], names: Mapping[int, str], codes: Sequence[int]
-) -> dict[str, Any]:
+    base: Any, info: JsonObject, names: Mapping[int, str], codes: Sequence[int]
+) -> JsonObject:
     """Return the manifest's entries for a model that is a base's passes and a forest on top.
 
     Parameters

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import OptionError
+from ..base.json_types import StageJson
 from ..features.point_grid import check_xyz
 from .input_dimensions import DEFAULT_DIMENSIONS, OPTIONAL_DIMENSIONS, required_dimensions
 from .interface import preprocessing, trainer_of
@@ -49,7 +50,7 @@ def train(
     if isinstance(labels, TrainingOptions):
         options, labels = labels, None
     options = options or TrainingOptions()
-    preparation: list[dict[str, Any]] = []
+    preparation: list[StageJson] = []
     sources: Any = [clouds] if isinstance(clouds, TrainingCloud) else clouds
     if labels is not None:
         cloud = TrainingCloud(check_xyz(clouds), labels, dimensions or {})

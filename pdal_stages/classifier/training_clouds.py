@@ -17,6 +17,7 @@ from ..accuracy.labels import as_codes
 from ..base.asprs import UNINFORMATIVE
 from ..base.errors import OptionError, StageError
 from ..base.hashing import hash_rows
+from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from ..base.version import __version__
 from ..features.cell_means import density
@@ -63,13 +64,13 @@ class TrainingCloud:
         return as_codes(self.labels, f"label of {self.name}")
 
     @property
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self) -> dict[str, npt.NDArray]:
         """Return all values of the points by name; dimensions as ``d/Intensity``."""
         values = {"xyz": self.xyz, "labels": self.labels, "mask": self.mask}
         values |= {f"d/{name}": array for name, array in self.dimensions.items()}
         return {name: np.asarray(array) for name, array in values.items() if array is not None}
 
-    def with_arrays(self, arrays: Mapping[str, npt.NDArray[Any]], **more: Any) -> TrainingCloud:
+    def with_arrays(self, arrays: Mapping[str, npt.NDArray], **more: Any) -> TrainingCloud:
         """Return a cloud of other points, with values as of :attr:`arrays`; the rest stays."""
         dimensions = {name[2:]: values for name, values in arrays.items() if name.startswith("d/")}
         known: dict[str, Any] = {name: arrays.get(name) for name in ("xyz", "labels", "mask")}
@@ -186,12 +187,12 @@ class Labeled:
         self,
         options: TrainingOptions,
         counts: Iterable[Mapping[str, int]],
-        training: Mapping[str, Any],
+        training: JsonObject,
         importances: Iterable[Sequence[float] | None],
         packages: Iterable[str],
-        crossed: Mapping[str, Any] | None = None,
+        crossed: JsonObject | None = None,
         **more: Any,
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         """Return the manifest of a model trained on the clouds.
 
         `counts` are those of each class's samples, `importances` those of each pass, `crossed` is

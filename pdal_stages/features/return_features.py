@@ -44,7 +44,7 @@ def return_features(
     xyz: npt.NDArray[np.float64],
     dimensions: Mapping[str, npt.ArrayLike],
     threads: int | None = None,
-) -> dict[str, npt.NDArray[Any]]:
+) -> dict[str, npt.NDArray]:
     """Compute those of `names` that are return features, for every point of a cloud.
 
     The columns (n,) are from 0 to 1: uint8 of the point itself, float32 of its surroundings.
@@ -62,13 +62,13 @@ def return_features(
     flags[:, 0] = np.where(total > 1, WHOLE, 0)
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
     del number, total
-    values: dict[str, npt.NDArray[Any]] = {}
+    values: dict[str, npt.NDArray] = {}
     for scale, (axes, side) in SCALES.items():
         columns = {flag + scale: number for number, flag in enumerate(FLAGS)}
         if not wanted & columns.keys():
             continue
         cell: Any = slice(None)
-        means: npt.NDArray[Any] = (flags > 0).view(np.uint8)
+        means: npt.NDArray = (flags > 0).view(np.uint8)
         if axes:
             cell, means = cell_means(xyz[:, :axes], flags, side)
         values |= {name: means[:, k][cell] for name, k in columns.items() if name in wanted}

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,16 +39,16 @@ class Representatives:
     """Points that stand for others."""
 
     #: The representatives' rows in the cloud, ascending.
-    rows: npt.NDArray[Any]
+    rows: npt.NDArray
     #: Those of them, by their place in `rows`, ascending, that stand for a point that was asked
     #: for; None: all.
     wanted: npt.NDArray[np.int64] | None
-    _members: npt.NDArray[Any]  # points asked for, by representative
-    _start: npt.NDArray[Any]
+    _members: npt.NDArray  # points asked for, by representative
+    _start: npt.NDArray
 
     def members(
         self, block: npt.NDArray[np.int64] | slice
-    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
+    ) -> tuple[npt.NDArray, npt.NDArray[np.int64]]:
         """Return the points that a block of representatives stands for, and their place in it."""
         first, last = self._start[:-1][block], self._start[1:][block]
         number = last - first
@@ -85,7 +84,7 @@ def represent(
         is_kept[gone] = False
         rows = present if rows is None else rows
     kept = np.flatnonzero(is_kept)
-    place: npt.NDArray[Any] = np.cumsum(is_kept, dtype=small)
+    place: npt.NDArray = np.cumsum(is_kept, dtype=small)
     np.subtract(place, 1, out=place)
     if by is not None:
         place = place[by]
@@ -104,7 +103,7 @@ def _one_each(
     side: float,
     values: Iterable[npt.ArrayLike],
     present: npt.NDArray[np.int64] | None,
-) -> npt.NDArray[Any] | None:
+) -> npt.NDArray | None:
     """Return the point (n,) that stands for each; None where no voxel holds two.
 
     Points that are not `wanted` stand for themselves.

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ..base.json_types import JsonObject
 from .cells import THOUSANDTHS
 
 #: Verdicts.
@@ -74,7 +75,7 @@ class ObjectCells(NamedTuple):
         """Median height of the ground, NaN where it is not known."""
         return float(np.nanmedian(self.ground)) if not np.isnan(self.ground).all() else math.nan
 
-    def describe(self, measures: dict[str, Any], reasons: dict[str, bool]) -> dict[str, Any]:
+    def describe(self, measures: JsonObject, reasons: dict[str, bool]) -> JsonObject:
         """Return the measures with points, mean reliability (NaN if unknown) and verdict."""
         rated = int(self.rated.sum())
         reliability = float(self.reliability.sum()) / rated / THOUSANDTHS if rated else math.nan
@@ -84,7 +85,7 @@ class ObjectCells(NamedTuple):
         return {**measures, "points": int(self.points.sum()), "reliab": reliability, **verdict}
 
 
-def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
+def measure_building(cells: ObjectCells, size: float) -> JsonObject:
     """Return heights and verdict of a building."""
     raster, ground = cells.raster(cells.z), cells.ground_height
     inside, area = ~np.isnan(raster), len(cells.row) * size * size
@@ -108,7 +109,7 @@ def measure_building(cells: ObjectCells, size: float) -> dict[str, Any]:
     )
 
 
-def measure_tree(cells: ObjectCells, top_row: int, top_column: int, size: float) -> dict[str, Any]:
+def measure_tree(cells: ObjectCells, top_row: int, top_column: int, size: float) -> JsonObject:
     """Return place, height, crown and verdict of a tree."""
     area = len(cells.row) * size * size
     above = cells.z - cells.ground
@@ -129,7 +130,7 @@ def measure_tree(cells: ObjectCells, top_row: int, top_column: int, size: float)
     )
 
 
-def measure_span(cells: ObjectCells, size: float) -> dict[str, Any]:
+def measure_span(cells: ObjectCells, size: float) -> JsonObject:
     """Return length, clearance, sag, path and verdict of the wires between two masts."""
     path = wire_path(cells, size)
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))]
@@ -169,7 +170,7 @@ def wire_path(cells: ObjectCells, size: float) -> NDArray[np.float64]:
     return np.column_stack([x.min() + u * c - v * s, y.min() + u * s + v * c, z])
 
 
-def measure_deck(cells: ObjectCells, size: float) -> dict[str, Any]:
+def measure_deck(cells: ObjectCells, size: float) -> JsonObject:
     """Return area, height, clearance and verdict of a bridge deck."""
     area, ground, z = len(cells.row) * size * size, cells.ground_height, float(np.median(cells.z))
     return cells.describe(

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from ..base.grid import GridWindow, cell_keys, split_keys
+from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from . import attributes, crowns
 from .attributes import ObjectCells
@@ -41,7 +42,7 @@ SPAN_GAP = 2.0
 
 class _Object(NamedTuple):
     identity: int
-    record: dict[str, Any]  # measures and verdict
+    record: JsonObject  # measures and verdict
     cells: ObjectCells
     keys: NDArray[np.int64]  # of the cells whose points belong to it
 
@@ -187,7 +188,7 @@ def _measured(
     z: NDArray,
     core: GridWindow,
     kind: Kind,
-    measure: Callable[[ObjectCells, float], dict[str, Any]],
+    measure: Callable[[ObjectCells, float], JsonObject],
 ) -> Iterator[_Object]:
     """Yield the objects whose first cell lies in the block; `owner` labels cells' points."""
     window, none = view.window, np.empty(0, np.int64)

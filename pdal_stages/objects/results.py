@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.grid import places_among
+from ..base.json_types import JsonObject
 from ..base.options import Settings, setting
 from .cells import Kind, point_keys
 
@@ -84,7 +85,7 @@ class Objects:
             ids[rows] = np.where(exists, self.owner[place], 0)
         return ids
 
-    def summary(self) -> dict[str, dict[str, Any]]:
+    def summary(self) -> dict[str, JsonObject]:
         """Return, by kind, the number of objects, how many are to be checked, and why."""
         out = {}
         for kind, table in self.tables.items():

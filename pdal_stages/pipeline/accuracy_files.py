@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import DimensionError, StageError, suggest
 from ..base.files import check_outputs
+from ..base.json_types import StageJson
 from ..base.las import header_there
 from ..base.las_check import check_readable
 from ..base.las_points import LasColumns, Layout
@@ -51,7 +52,7 @@ def compare_files(
     files = input_files(sources)
     pairs = paired(files, input_files(references)) if references else [(file, "") for file in files]
     listed = {"files": [name for pair in pairs for name in pair if name]}
-    wanted: dict[str, Any] = {"type": "filters.accuracy", **listed, **outputs}
+    wanted: StageJson = {"type": "filters.accuracy", **listed, **outputs}
     (options,) = apply_overrides([wanted], overrides)
     renamed = {"dimension": "Classification", "reference": "Reference"}
     stage = cast(AccuracyStage, stage_from({**options, **renamed}))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import whole_files
+from ..base.json_types import StageJson
 from ..base.las_check import beyond_box, check_complete
 from ..base.las_copy import LasCopy
 from ..base.las_points import LasColumns, Layout, layout_there
@@ -104,7 +104,7 @@ def _box_of(columns: Mapping[str, NDArray]) -> tuple[float, float, float, float]
 
 
 def _write_through_pdal(
-    copy: LasCopy, values: Mapping[str, NDArray], writer: Mapping[str, Any]
+    copy: LasCopy, values: Mapping[str, NDArray], writer: StageJson
 ) -> list[str]:
     """Let PDAL write what a copy would hold, by the options of a writer; return its log."""
     folder = Path(writer["filename"]).absolute().parent

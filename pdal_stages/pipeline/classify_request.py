@@ -11,6 +11,7 @@ from typing import Any
 
 from ..base.asprs import OVERLAP, TERRAIN
 from ..base.errors import ModelError, OptionError, suggest
+from ..base.json_types import StageJson
 from ..base.selections import split_selection
 from ..classifier.model import loaded_model
 from ..classifier.model_file import STANDARD
@@ -47,14 +48,14 @@ class ClassifyRequest:
     given_ground: bool = False  #: points of the classes TERRAIN are the ground, and stay so
 
     @property
-    def _inside(self) -> dict[str, Any]:
+    def _inside(self) -> StageJson:
         """The condition of stages: points that were marked as they came in, before any stage."""
         return {"where": f"{SELECTED} == 1"} if self.where else {}
 
     @cached_property
-    def _classifier(self) -> dict[str, Any]:
+    def _classifier(self) -> StageJson:
         """The classifier as an object of a pipeline, before overrides."""
-        stage: dict[str, Any] = {
+        stage: StageJson = {
             "type": "filters.modelclassifier",
             "model": self.model,
             "compact": True,
@@ -67,7 +68,7 @@ class ClassifyRequest:
         return stage
 
     @cached_property
-    def _settled(self) -> dict[str, Any]:
+    def _settled(self) -> StageJson:
         """The classifier with overrides."""
         return overridden(self._classifier, self.overrides)
 
@@ -85,7 +86,7 @@ class ClassifyRequest:
         return loaded_model(self._settled["model"])
 
     @cached_property
-    def stages(self) -> list[dict[str, Any]]:
+    def stages(self) -> list[StageJson]:
         """The stages: noise, preprocessing of what the model reads, the classifier, corrections."""
         if by_hand := self.loaded.info.get("by_hand"):
             raise ModelError(
@@ -98,7 +99,7 @@ class ClassifyRequest:
         if self.where:
             Expression(self.where)  # which refuses what it cannot read
         prepared, keep_ground = self._prepared()
-        noise: dict[str, Any] = {"type": "filters.detachednoise", **self._inside}
+        noise: StageJson = {"type": "filters.detachednoise", **self._inside}
         if keep_ground:
             others = " && ".join(f"Classification != {code}" for code in TERRAIN)
             noise["where"] = f"{noise['where']} && {others}" if self.where else others
@@ -106,7 +107,7 @@ class ClassifyRequest:
         first = [noise] if self.noise else []
         return [*first, *prepared, classifier, *self._corrections(keep_ground)]
 
-    def _prepared(self) -> tuple[list[dict[str, Any]], bool]:
+    def _prepared(self) -> tuple[list[StageJson], bool]:
         """Return the stages before the classifier, and whether they take ground that is given.
 
         The model names these stages, or they follow from its dimensions.
@@ -126,14 +127,12 @@ class ClassifyRequest:
             stages = [{**s, "ground": True} if s["type"] == _GROUND else s for s in stages]
         return stages, any(stage.get("given_ground") for stage in stages)
 
-    def _corrections(self, keep_ground: bool) -> list[dict[str, Any]]:
+    def _corrections(self, keep_ground: bool) -> list[StageJson]:
         """Return the stages after the classifier that were requested, polygons last."""
         settled = self._settled
-        shared: dict[str, Any] = {
-            name: settled[name] for name in ("ignore", "keep") if name in settled
-        }
+        shared: StageJson = {name: settled[name] for name in ("ignore", "keep") if name in settled}
         kept = split_selection(shared.get("keep", OVERLAP))
-        stages: list[dict[str, Any]] = []
+        stages: list[StageJson] = []
         if self.bridges:
             bridges = {"type": "filters.bridges", **shared}
             if keep_ground:
@@ -171,7 +170,7 @@ class ClassifyRequest:
         every = "all" in self.dimensions
         return {name: kind for name, kind in created.items() if every or name in self.dimensions}
 
-    def writer(self, target: str) -> dict[str, Any]:
+    def writer(self, target: str) -> StageJson:
         """Return the writer of an output; OptionError for files that `classify` does not write."""
         if Path(target).suffix.lower() in (".tif", ".tiff", ".gpkg", ".shp", ".geojson"):
             raise OptionError(

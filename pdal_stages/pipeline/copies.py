@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.json_types import StageJson
 from ..base.las import named_copc, number_type
 from ..base.las_copy import LasCopy
 from ..base.las_points import PART, Layout, read_records
@@ -31,7 +32,7 @@ _READER = {"type", "filename", "tag", "use_eb_vlr", "override_srs", "default_srs
 _WRITER = {"type", "filename", "tag", "forward"}
 
 
-def read_here(stages: Sequence[Mapping[str, Any]]) -> bool:
+def read_here(stages: Sequence[StageJson]) -> bool:
     """Return whether a pipeline reads LAS files that need no PDAL, and all its filters are ours."""
     for stage in stages:
         kind, names = stage["type"], stage.get("filename")
@@ -44,7 +45,7 @@ def read_here(stages: Sequence[Mapping[str, Any]]) -> bool:
     return True
 
 
-def written_here(stages: Sequence[Mapping[str, Any]]) -> bool:
+def written_here(stages: Sequence[StageJson]) -> bool:
     """Return whether a pipeline writes a LAS file that keeps everything, and nothing else."""
     writers = [stage for stage in stages if stage["type"].startswith("writers.")]
     if len(writers) != 1 or writers[0]["type"] != "writers.las" or not writers[0].keys() <= _WRITER:
@@ -109,7 +110,7 @@ def describe_selection(where: str | None, known: Mapping[str, NDArray]) -> list[
 
 
 def copy_of(
-    source: str, layout: Layout, target: str, added: Mapping[str, str], reader: Mapping[str, Any]
+    source: str, layout: Layout, target: str, added: Mapping[str, str], reader: StageJson
 ) -> LasCopy:
     """Return a copy that is to be written; `added` maps names of dimensions to PDAL types.
 

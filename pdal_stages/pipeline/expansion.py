@@ -11,10 +11,10 @@ import itertools
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from ..base.dimensions import known
 from ..base.errors import DimensionError, PipelineError, StageError
+from ..base.json_types import StageJson
 from ..base.las_points import layout_there
 from ..classifier.model_file import find
 from ..features.registry import BY_NAME
@@ -39,7 +39,7 @@ SPLITS = {
 class Expanded:
     """A plain PDAL pipeline, those of its stages that are ours, and warnings for the user."""
 
-    stages: list[dict[str, Any]]
+    stages: list[StageJson]
     ours: list[ExpandedStage] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -66,7 +66,7 @@ def expand(
             continue
         try:
             if _may_be_apart(stages, index, several):
-                merge: dict[str, Any] = {"type": "filters.merge"}
+                merge: StageJson = {"type": "filters.merge"}
                 if "inputs" in stage:
                     merge |= {"inputs": stage["inputs"], "tag": f"pdal_stages_merge_{index}"}
                     stage["inputs"] = [merge["tag"]]
@@ -91,7 +91,7 @@ def expand(
 # ---- how PDAL wires stages -----------------------------------------------------------------------
 
 
-def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) -> bool:
+def _may_be_apart(stages: Sequence[StageJson], number: int, several: bool) -> bool:
     """Return whether points may reach a stage in several views, and nobody wants them apart.
 
     The plugin, which sees PDAL's stages instead of JSON, decides by `viewsOf` of ``stage.cpp``.
@@ -107,7 +107,7 @@ def _may_be_apart(stages: Sequence[dict[str, Any]], number: int, several: bool) 
     return several and not split and not joined
 
 
-def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str]) -> None:
+def _refuse_several_ends(stages: Sequence[StageJson], where: Sequence[str]) -> None:
     """Refuse several ends: PDAL runs only what leads to the first, and says nothing of others."""
     tagged: dict[str, int] = {}
     waiting: list[int] = []  # stages that the next one takes points from
@@ -141,7 +141,7 @@ def _refuse_several_ends(stages: Sequence[dict[str, Any]], where: Sequence[str])
 
 
 def settle_upstream(
-    stage: Stage, before: Sequence[tuple[Mapping[str, Any], Mapping[str, str]]]
+    stage: Stage, before: Sequence[tuple[StageJson, Mapping[str, str]]]
 ) -> tuple[Stage, bool]:
     """Return a stage placed after those that created what it reads.
 
@@ -161,7 +161,7 @@ def settle_upstream(
     return stage.after(makers), created_before
 
 
-def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
+def heights_of(stage: StageJson) -> dict[str, str]:
     """Return the dimensions that a PDAL stage creates and ours may read: name -> PDAL type."""
     makes = stage.get("type") in preprocessing.HEIGHTS_OF_PDAL
     return {"HeightAboveGround": "double"} if makes else {}
@@ -170,7 +170,7 @@ def heights_of(stage: Mapping[str, Any]) -> dict[str, str]:
 def _place_upstream(expanded: Expanded) -> None:
     """Place each of our stages after the earlier ones that created what it reads."""
     numbered = {ours.index: ours for ours in expanded.ours}
-    before: list[tuple[Mapping[str, Any], Mapping[str, str]]] = []
+    before: list[tuple[StageJson, Mapping[str, str]]] = []
     for index, plain in enumerate(expanded.stages):
         if (ours := numbered.get(index)) is None:
             before.append((plain, heights_of(plain)))
@@ -226,7 +226,7 @@ def _is_created(name: str) -> bool:
     return feature or (known(name) is not None and name != "Classification")
 
 
-def _may_create(name: str, stage: Mapping[str, Any]) -> bool:
+def _may_create(name: str, stage: StageJson) -> bool:
     """Return whether a stage of PDAL may create a dimension; readers but those of LAS may."""
     if is_reader(stage):
         files = readers_files([stage], las=True)
@@ -257,7 +257,7 @@ def stage_files(stage: Stage) -> list[str]:
 
 
 def expand_stage(
-    as_written: dict[str, Any], number: int = 0, index: int = 0, stage: Stage | None = None
+    as_written: StageJson, number: int = 0, index: int = 0, stage: Stage | None = None
 ) -> ExpandedStage:
     """Return a stage of ours, checked, and the ``filters.python`` that stands for it."""
     stage = stage or stage_from(as_written)
@@ -272,13 +272,13 @@ def expand_stage(
     return expanded
 
 
-def fuse_scripts(stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def fuse_scripts(stages: Sequence[StageJson]) -> list[StageJson]:
     """Return an expanded pipeline with one filter for stages of ours that follow one another.
 
     For each filter PDAL copies all dimensions of all points, up to a tenth of a job's time. What
     tags and inputs wire stays as it is; a stage that forgets dimensions is the last of its filter.
     """
-    out: list[dict[str, Any]] = []
+    out: list[StageJson] = []
     for stage in stages:
         before = out[-1] if out else {}
         wired = (before.keys() - {"inputs"} | stage.keys()).intersection(PDAL_OWN)

@@ -8,12 +8,13 @@ from __future__ import annotations
 import glob
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
 from ..base.files import LAS, Output
+from ..base.json_types import StageJson
 from ..base.las import named_copc, named_las, refuse_pipe
 
 #: File name of the description of an EPT source.
@@ -169,7 +170,7 @@ def named_outputs(target: str, names: Sequence[str]) -> list[str]:
 # ---- files of PDAL's stages ----------------------------------------------------------------------
 
 
-def readers_files(stages: Sequence[Mapping[str, Any]], *, las: bool = False) -> list[str]:
+def readers_files(stages: Sequence[StageJson], *, las: bool = False) -> list[str]:
     """Return the local files that PDAL's readers read; only LAS and LAZ files with `las`.
 
     Patterns are replaced by the files that match.
@@ -186,7 +187,7 @@ def readers_files(stages: Sequence[Mapping[str, Any]], *, las: bool = False) -> 
     return files
 
 
-def named_files(stages: Sequence[Mapping[str, Any]]) -> list[str]:
+def named_files(stages: Sequence[StageJson]) -> list[str]:
     """Return existing files named in any option of PDAL's stages: polygons, rasters, scripts."""
     files: list[str] = []
     for stage in stages:
@@ -205,12 +206,12 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(inner)
 
 
-def is_reader(stage: Mapping[str, Any]) -> bool:
+def is_reader(stage: StageJson) -> bool:
     """Return whether a stage is a reader."""
     return stage["type"].startswith("readers.")
 
 
-def is_writer(stage: Mapping[str, Any]) -> bool:
+def is_writer(stage: StageJson) -> bool:
     """Return whether a stage writes a local file."""
     name, kind = stage.get("filename"), stage["type"]
     if not kind.startswith("writers.") or not isinstance(name, str) or "://" in name:
@@ -218,18 +219,18 @@ def is_writer(stage: Mapping[str, Any]) -> bool:
     return kind != "writers.text" or name.upper() != "STDOUT"  # which PDAL prints
 
 
-def writes_las(stage: Mapping[str, Any]) -> bool:
+def writes_las(stage: StageJson) -> bool:
     """Return whether a stage writes LAS."""
     return stage["type"] in LAS_WRITERS
 
 
-def writers_outputs(stages: list[dict[str, Any]]) -> list[Output]:
+def writers_outputs(stages: list[StageJson]) -> list[Output]:
     """Return the files that PDAL's writers write."""
     writers = filter(is_writer, stages)
     return [Output(s["filename"], "output", LAS if writes_las(s) else "") for s in writers]
 
 
-def with_outputs(stages: list[dict[str, Any]], names: list[Any]) -> list[dict[str, Any]]:
+def with_outputs(stages: list[StageJson], names: list[Any]) -> list[StageJson]:
     """Return the stages with other names for the files that writers write."""
     waiting = iter(names)
     return [{**s, "filename": str(next(waiting))} if is_writer(s) else s for s in stages]

@@ -15,6 +15,7 @@ from typing import Any
 
 from ..base.checks import refuse_constant, refuse_nested
 from ..base.errors import OptionError, PipelineError, suggest
+from ..base.json_types import StageJson
 from ..stages.registry import refuse_removed
 
 #: No pipeline file has as many bytes; devices, such as /dev/zero, have no end.
@@ -262,7 +263,7 @@ def apply_overrides(stages: list[Any], overrides: Iterable[Override]) -> list[An
     return out
 
 
-def overridden(stage: dict[str, Any], overrides: Iterable[Override]) -> dict[str, Any]:
+def overridden(stage: StageJson, overrides: Iterable[Override]) -> StageJson:
     """Return a stage with the overrides of its type."""
     of_type = [o for o in overrides if not o.by_tag and o.selector == stage["type"]]
     return apply_overrides([stage], of_type)[0]

@@ -22,6 +22,7 @@ from functools import cache
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError
+from ..base.json_types import JsonObject, StageJson
 from ..base.las import named_copc, named_las, source_id
 from ..base.las_check import check_readable
 from .inputs_outputs import readers_files
@@ -39,7 +40,7 @@ class Execution:
     """The result of running a pipeline."""
 
     count: int
-    metadata: dict[str, Any] = field(default_factory=dict)
+    metadata: JsonObject = field(default_factory=dict)
     arrays: list = field(default_factory=list)
     log: str = ""
 
@@ -89,7 +90,7 @@ def ask_program(*arguments: str) -> str:
     raise PipelineError(f"pdal {' '.join(arguments)} failed", found=output)
 
 
-def drivers() -> list[dict[str, Any]]:
+def drivers() -> list[StageJson]:
     """Return PDAL's stages: name, description, link, extensions."""
     return json.loads(ask_program("--drivers", "--showjson"))
 
@@ -97,24 +98,22 @@ def drivers() -> list[dict[str, Any]]:
 # ---- stages --------------------------------------------------------------------------------------
 
 
-def reader_of(source: str, tag: str) -> dict[str, Any]:
+def reader_of(source: str, tag: str) -> StageJson:
     """Return the reader of a file."""
     plain = {"type": "readers.las"} if named_las(source) and not named_copc(source) else {}
     return with_types([{"filename": str(source), "tag": tag, **plain}])[0]
 
 
-def writer_of(target: str) -> dict[str, Any]:
+def writer_of(target: str) -> StageJson:
     """Return a writer that keeps the input's header, where it is a LAS file."""
-    stage: dict[str, Any] = {"filename": target, "tag": "output"}
+    stage: StageJson = {"filename": target, "tag": "output"}
     if named_las(target):
         kind = "writers.copc" if named_copc(target) and knows_copc() else "writers.las"
         stage |= {"type": kind, "forward": "all"}
     return stage
 
 
-def with_types(
-    stages: Sequence[Any], where: Callable[[int], str] | None = None
-) -> list[dict[str, Any]]:
+def with_types(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> list[StageJson]:
     """Return stages as objects with the types that PDAL infers from file names.
 
     Readers of LAS read extra dimensions of all versions.
@@ -152,7 +151,7 @@ def with_types(
 
 
 def execute(
-    stages: list[dict[str, Any]], *, arrays: bool = True, loglevel: int = logging.WARNING
+    stages: list[StageJson], *, arrays: bool = True, loglevel: int = logging.WARNING
 ) -> Execution:
     """Run a plain PDAL pipeline in this process.
 
@@ -179,7 +178,7 @@ _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure (?!\(\d+\) PR
 
 
 @runs_pdal
-def _execute(stages: list[dict[str, Any]], arrays: bool, loglevel: int) -> Execution:
+def _execute(stages: list[StageJson], arrays: bool, loglevel: int) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
     pipeline = None
@@ -232,7 +231,7 @@ def _log(pipeline: Any) -> str:
         return ""
 
 
-def validate(stages: list[dict[str, Any]]) -> None:
+def validate(stages: list[StageJson]) -> None:
     """Let the program `pdal` check stages and their options, without reading points."""
     text = json.dumps({"pipeline": for_this_version(stages)})
     done = _run_program("pipeline", "--validate", "--stdin", input=text, timeout=300)
@@ -247,7 +246,7 @@ def validate(stages: list[dict[str, Any]]) -> None:
 # ---- what differs between versions ---------------------------------------------------------------
 
 
-def for_this_version(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def for_this_version(stages: list[StageJson]) -> list[StageJson]:
     """Return stages that this PDAL knows: before 2.4 a COPC file is read as plain LAZ.
 
     Options that old PDAL reads from uninitialized memory are set where the user does not: the file
@@ -269,7 +268,7 @@ def for_this_version(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-def _file_source(writer: dict[str, Any], before: list[dict[str, Any]]) -> int:
+def _file_source(writer: StageJson, before: list[StageJson]) -> int:
     """Return the file source id that a writer forwards; 0 where inputs differ or are LAS 1.0."""
     forward = str(writer.get("forward", ""))
     forwards = any(word in forward for word in ("all", "header", "filesource_id"))

@@ -8,12 +8,13 @@ kept, since COPC files are usual inputs: see :func:`..base.las.supersede_copc`.
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
+from ..base.json_types import StageJson
 from ..base.las import (
     POINT_BYTES,
     WAVES,
@@ -51,33 +52,33 @@ class Fact(NamedTuple):
     until: tuple[int, int, int]  #: the first version that does not
     what: str
     #: Returns what shows it, of a file, its header and its reader; empty where it does not apply.
-    shows: Callable[[str, LasHeader, Mapping[str, Any]], str]
+    shows: Callable[[str, LasHeader, StageJson], str]
     cure: str = CURE
 
 
-def _pattern(path: str, header: LasHeader, reader: Mapping[str, Any]) -> str:
+def _pattern(path: str, header: LasHeader, reader: StageJson) -> str:
     return path if glob.has_magic(path) else ""
 
 
-def _unread_keys(path: str, header: LasHeader, reader: Mapping[str, Any]) -> str:
+def _unread_keys(path: str, header: LasHeader, reader: StageJson) -> str:
     if header.minor < 4 or reader.keys() & {"override_srs", "default_srs", "spatialreference"}:
         return ""
     numbers = [number for number, data in projection_records(path) if len(data) >= 8]
     return f"{path}, LAS 1.{header.minor}" if 34735 in numbers else ""
 
 
-def _waveforms(path: str, header: LasHeader, reader: Mapping[str, Any]) -> str:
+def _waveforms(path: str, header: LasHeader, reader: StageJson) -> str:
     found = f"{path}, point format {header.point_format}"
     return found if header.point_format in WAVES else ""
 
 
-def _overwritten(path: str, header: LasHeader, reader: Mapping[str, Any]) -> str:
+def _overwritten(path: str, header: LasHeader, reader: StageJson) -> str:
     if reader.keys() & {"extra_dims", "ignore_vlr"}:
         return ""
     return ", ".join(overwritten_names(Layout.of(path)))
 
 
-def _odd_text(path: str, header: LasHeader, reader: Mapping[str, Any]) -> str:
+def _odd_text(path: str, header: LasHeader, reader: StageJson) -> str:
     with open(path, "rb") as file:
         texts = [file.read(90)[26:90], *(part for r in records(file, header) for part in r[1:4:2])]
     wrong = next((text for text in texts if not _is_utf8(text)), b"")
@@ -92,7 +93,7 @@ def _is_utf8(text: bytes) -> bool:
     return True
 
 
-def _undescribed(path: str, header: LasHeader, reader: Mapping[str, Any]) -> str:
+def _undescribed(path: str, header: LasHeader, reader: StageJson) -> str:
     if reader.keys() & {"extra_dims", "ignore_vlr"}:
         return ""
     data = [data for r, data in records_of(path, b"LASF_Spec") if r.number == 4]
@@ -149,7 +150,7 @@ FACTS = (
 )
 
 
-def check_inputs(stages: Sequence[Mapping[str, Any]]) -> None:
+def check_inputs(stages: Sequence[StageJson]) -> None:
     """Refuse LAS files that readers among stages would misread.
 
     Raises
@@ -207,7 +208,7 @@ def _plain(name: str) -> str:
 # ---- what is written -----------------------------------------------------------------------------
 
 
-def las_version(writer: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+def las_version(writer: StageJson, before: Sequence[StageJson]) -> tuple[int, int]:
     """Return (minor_version, dataformat_id) that a writer will use.
 
     They come from its options, the forwarded header, or PDAL's defaults.
@@ -229,13 +230,13 @@ def las_version(writer: Mapping[str, Any], before: Sequence[Mapping[str, Any]]) 
     return minor, format_id
 
 
-def las_headers(readers: Sequence[Mapping[str, Any]]) -> list[LasHeader]:
+def las_headers(readers: Sequence[StageJson]) -> list[LasHeader]:
     """Return the headers of the LAS files that stages read, where they can be read."""
     return [h for h in map(header_there, readers_files(readers, las=True)) if h is not None]
 
 
 def check_outputs(
-    stages: list[dict[str, Any]], ours: Collection[ExpandedStage], copied: bool = False
+    stages: list[StageJson], ours: Collection[ExpandedStage], copied: bool = False
 ) -> None:
     """Refuse class codes and numbers of extra dimensions that a later LAS writer cannot hold.
 
@@ -264,9 +265,7 @@ def check_outputs(
                 )
 
 
-def _code_limit(
-    writer: dict[str, Any], before: list[dict[str, Any]], copied: bool
-) -> tuple[str, str] | None:
+def _code_limit(writer: StageJson, before: list[StageJson], copied: bool) -> tuple[str, str] | None:
     """Return the message for codes above 31, and the cure; None where all codes fit."""
     if writer["type"] == "writers.copc":
         return None
@@ -283,7 +282,7 @@ def _code_limit(
     return what, "Name the output .las, use PDAL 2.3, or run pdal-stages classify"
 
 
-def _compresses(writer: Mapping[str, Any]) -> bool:
+def _compresses(writer: StageJson) -> bool:
     named = str(writer.get("filename", "")).lower().endswith(".laz")
     return named or str(writer.get("compression", "")).lower() not in ("", "none", "false")
 
@@ -292,7 +291,7 @@ def _compresses(writer: Mapping[str, Any]) -> bool:
 _NO_CLASSES = ("writers.gdal", "writers.null", "writers.raster", *stage_types())
 
 
-def check_flags(stages: Sequence[Mapping[str, Any]]) -> None:
+def check_flags(stages: Sequence[StageJson]) -> None:
     """Refuse flags of LAS 1.0-1.3 that PDAL before 2.6 would make parts of classes.
 
     It does where the points come together with those of LAS 1.4, or are written to another format.
@@ -317,7 +316,7 @@ def check_flags(stages: Sequence[Mapping[str, Any]]) -> None:
                 raise PipelineError(what, where=path, cure=cure)
 
 
-def check_copc_outputs(stages: Iterable[Mapping[str, Any]]) -> None:
+def check_copc_outputs(stages: Iterable[StageJson]) -> None:
     """Refuse a plain LAZ file under the name of a COPC file."""
     for stage in stages:
         name = str(stage.get("filename", ""))
@@ -326,7 +325,7 @@ def check_copc_outputs(stages: Iterable[Mapping[str, Any]]) -> None:
             raise PipelineError("writers.las writes plain LAZ, not COPC", found=name, cure=cure)
 
 
-def check_units(stages: Sequence[Mapping[str, Any]]) -> None:
+def check_units(stages: Sequence[StageJson]) -> None:
     """Refuse LAS 1.0-1.3 whose units across and upward differ: GDAL's keys have one of them.
 
     Where a stage moves points, or the writer names a reference, nothing is known.

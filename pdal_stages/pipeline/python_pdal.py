@@ -10,6 +10,7 @@ import logging
 from typing import Any
 
 from ..base.errors import StageError
+from ..base.json_types import StageJson
 from ..stages.base import Stage
 from ..stages.registry import stage_type, stage_types
 from . import pdal as pdal_env
@@ -71,7 +72,7 @@ def _signature(kind: type[Stage]) -> inspect.Signature:
     return inspect.Signature(parameters)
 
 
-def _joined(stages: list[dict[str, Any]], made_from: runtime.ExpandedStage):
+def _joined(stages: list[StageJson], made_from: runtime.ExpandedStage):
     """Return the filters that PDAL runs as one object, which joins others by ``|``.
 
     `made_from` is kept as long as they are.

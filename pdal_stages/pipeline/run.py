@@ -13,8 +13,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from numpy.typing import NDArray
+
 from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
+from ..base.json_types import JsonObject, StageJson
 from ..base.las import refuse_pipe, supersede_copc
 from ..base.las_check import check_complete, check_copc, check_ept, check_readable
 from ..base.messages import Report
@@ -83,7 +86,7 @@ class Pipeline:
         #: Whether PDAL takes no part: the output is a copy of the input.
         self.copied = may_copy and self.is_read_here and copies.written_here(stages)
         self.expanded: Expanded = expand(self.source, ready, self.copied)
-        self.metadata: dict[str, Any] = {}
+        self.metadata: JsonObject = {}
         self.arrays: list = []
         self.log_lines: list[str] = []
         self.warnings: list[str] = []
@@ -183,10 +186,10 @@ class Pipeline:
 
     def run_here(
         self,
-        columns: Mapping[str, Any],
+        columns: Mapping[str, NDArray],
         wkt: str,
-        known: Mapping[str, Any] | None = None,
-        after: Callable[[runtime.ExpandedStage, Mapping[str, Any]], None] | None = None,
+        known: Mapping[str, NDArray] | None = None,
+        after: Callable[[runtime.ExpandedStage, Mapping[str, NDArray]], None] | None = None,
     ) -> ChainMap[str, Any]:
         """Run its stages without PDAL; see :func:`.copies.run_stages`."""
         for ours in self.expanded.ours:
@@ -296,7 +299,7 @@ class Pipeline:
         if units := [ours.stage.horizontal_unit for ours in self.expanded.ours]:
             self.warnings += check_readers(stages, next(filter(None, units), ""))
 
-    def _check_text(self, reader: Mapping[str, Any]) -> None:
+    def _check_text(self, reader: StageJson) -> None:
         """Check a text file; let a writer of LAS hold its coordinates, where no option says how."""
         for path in readers_files([reader]):
             held = check_text(path, reader)
@@ -323,7 +326,7 @@ class Pipeline:
 
 
 def execute_whole(
-    stages: list[dict[str, Any]],
+    stages: list[StageJson],
     outputs: Sequence[str],
     check: Callable[[], None],
     *,
@@ -376,7 +379,7 @@ _STAGE_TYPE = re.compile(r"\b(?:readers|filters|writers)\.\w+")
 _NO_STAGE = re.compile(r"Couldn't create (?:reader|filter|writer) stage")
 
 
-def _named_metadata(metadata: dict[str, Any], expanded: Expanded) -> dict[str, Any]:
+def _named_metadata(metadata: JsonObject, expanded: Expanded) -> JsonObject:
     """Return PDAL's metadata, with our stages under their own names, not filters.python."""
     inner = metadata.get("metadata")
     if not isinstance(inner, dict):

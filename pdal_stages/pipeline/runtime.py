@@ -22,9 +22,11 @@ from typing import Any, cast
 from weakref import WeakValueDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import InterruptedStage, StageError
+from ..base.json_types import JsonObject, StageJson
 from ..base.messages import Report
 from ..stages.base import WHOLE_CLOUD, Stage, StageContext
 from ..stages.points import SELECTED, Points
@@ -43,8 +45,8 @@ class ExpandedStage:
     stage: Stage
     number: int  #: its index in the pipeline as written
     index: int  #: its index in the expanded pipeline
-    as_written: dict[str, Any]  #: its object in the pipeline
-    plain: dict[str, Any]  #: the ``filters.python`` that PDAL runs
+    as_written: StageJson  #: its object in the pipeline
+    plain: StageJson  #: the ``filters.python`` that PDAL runs
     context: StageContext = WHOLE_CLOUD  #: of its runs
     reports: list[Report] = field(default_factory=list)  #: one per point view
     failure: StageError | None = None
@@ -54,7 +56,7 @@ class ExpandedStage:
         self.context = replace(self.context, **facts)
 
     def function(
-        self, module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
+        self, module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
     ) -> None:
         """Run the stage on one view; its report is kept, and becomes PDAL's metadata."""
         report = run_on_view(self.stage, self.context, module, ins, outs)
@@ -63,7 +65,7 @@ class ExpandedStage:
 
 
 #: Gets the script's globals, the dimensions, and a dict for those to write back.
-Function = Callable[[dict[str, Any], Mapping[str, Any], dict[str, Any]], None]
+Function = Callable[[JsonObject, Mapping[str, NDArray], dict[str, NDArray]], None]
 
 
 @dataclass(eq=False)
@@ -96,8 +98,8 @@ BY_LABEL: WeakValueDictionary[str, ExpandedStage | Callback] = WeakValueDictiona
 
 
 def python_filter(
-    label: str, source: str, arguments: dict[str, Any], adds: Mapping[str, str]
-) -> dict[str, Any]:
+    label: str, source: str, arguments: JsonObject, adds: Mapping[str, str]
+) -> JsonObject:
     """Return a ``filters.python`` that runs `source` and adds dimensions (name -> PDAL type)."""
     return {
         "type": "filters.python",
@@ -109,7 +111,7 @@ def python_filter(
     }
 
 
-def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
+def run_stage(module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> bool:
     """Run an expanded stage, or several together, on one point view; always True (see above).
 
     Parameters
@@ -134,7 +136,7 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
             if held := BY_LABEL.get(label):
                 held.failure = failure
             outs.clear()
-            outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = None
+            outs[f"{_OPENING}{_encodable(str(failure))}{_CLOSING}"] = cast(NDArray, None)
             if _redirected():  # PDAL restores it only after a run that succeeds
                 sys.stdout = _usual_stdout
                 pdal_env.keep_alive(_usual_stdout)
@@ -144,10 +146,10 @@ def run_stage(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, An
 
 @interruptible
 def _run_interruptible(
-    arguments: Mapping[str, Any],
-    module: dict[str, Any],
-    ins: Mapping[str, Any],
-    outs: dict[str, Any],
+    arguments: JsonObject,
+    module: JsonObject,
+    ins: Mapping[str, NDArray],
+    outs: dict[str, NDArray],
 ) -> None:
     """Run a stage or a function on one view; any exception may come out, Ctrl-C too."""
     check_interrupt()
@@ -155,7 +157,7 @@ def _run_interruptible(
     (held or _from_arguments(arguments)).function(module, ins, outs)
 
 
-def _from_arguments(arguments: Mapping[str, Any]) -> ExpandedStage:
+def _from_arguments(arguments: JsonObject) -> ExpandedStage:
     """Return the stage of a pipeline that another process expanded."""
     named = {"type": arguments["stage"], "tag": arguments.get("tag")}
     as_written = {**arguments.get("options", {}), **named}
@@ -167,8 +169,8 @@ def _from_arguments(arguments: Mapping[str, Any]) -> ExpandedStage:
 def points_of(
     stage: Stage,
     context: StageContext,
-    module: Mapping[str, Any],
-    ins: Mapping[str, Any],
+    module: JsonObject,
+    ins: Mapping[str, NDArray],
 ) -> Points:
     """Return the points of a view, as a stage sees them; `module` are the script's globals."""
     metadata = module.get("metadata")
@@ -182,7 +184,7 @@ def points_of(
 
 
 def points_of_views(
-    arrays: Sequence[np.ndarray], metadata: dict[str, Any], make: Callable[..., Points] = Points
+    arrays: Sequence[np.ndarray], metadata: JsonObject, make: Callable[..., Points] = Points
 ) -> Points:
     """Return the points of all views that a pipeline gave, with the pipeline's metadata.
 
@@ -198,9 +200,9 @@ def points_of_views(
 def run_on_view(
     stage: Stage,
     context: StageContext,
-    module: Mapping[str, Any],
-    ins: Mapping[str, Any],
-    outs: dict[str, Any],
+    module: JsonObject,
+    ins: Mapping[str, NDArray],
+    outs: dict[str, NDArray],
 ) -> Report:
     """Run a stage on one view; return its report."""
     points = points_of(stage, context, module, ins)
@@ -264,7 +266,7 @@ def as_stage_error(error: BaseException, where: str) -> StageError:
 # ---- PDAL's metadata -----------------------------------------------------------------------------
 
 
-def reader_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
+def reader_metadata(metadata: JsonObject) -> JsonObject:
     """Return what PDAL's metadata of a run holds about the first reader; empty without one."""
     inner = metadata.get("metadata", {})
     node: Any = next((node for kind, node in inner.items() if kind.startswith("readers.")), {})
@@ -279,19 +281,17 @@ def wkt_of(reference: Any) -> str:
     return str(srs.get("compoundwkt") or srs.get("wkt") or srs.get("horizontal") or "")
 
 
-def node(
-    name: str, children: list[dict[str, Any]], value: str = "", kind: str = ""
-) -> dict[str, Any]:
+def node(name: str, children: list[JsonObject], value: str = "", kind: str = "") -> JsonObject:
     """Return a node of PDAL's metadata, as a script sets it."""
     return {"name": name, "value": value, "type": kind, "description": "", "children": children}
 
 
-def leaves(report: Report) -> list[dict[str, Any]]:
+def leaves(report: Report) -> list[StageJson]:
     """Return a report as nodes of PDAL's metadata."""
     return [leaf(key, value) for key, value in report.to_dict().items() if value is not None]
 
 
-def leaf(name: str, value: Any) -> dict[str, Any]:
+def leaf(name: str, value: Any) -> JsonObject:
     """Return one value as a node of PDAL's metadata: its text and type."""
     if isinstance(value, str):
         return node(name, [], _encodable(value), "string")
@@ -334,7 +334,7 @@ class Callbacks:
 
     def filter(
         self, function: Function, adds: Mapping[str, str] | None = None, **wiring: Any
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         """Return a ``filters.python`` that calls a function and adds dimensions.
 
         `adds` maps their names to PDAL's types; `wiring` are the filter's tag and inputs.
@@ -344,14 +344,14 @@ class Callbacks:
         BY_LABEL[label] = callback
         return {**python_filter(label, TRAMPOLINE, {"label": label}, adds or {}), **wiring}
 
-    def select(self, where: str, unknown: Collection[str]) -> dict[str, Any]:
+    def select(self, where: str, unknown: Collection[str]) -> JsonObject:
         """Return a filter that marks points for which a condition holds, as they come in.
 
         `unknown` are dimensions that only stages create, so that no condition can name them.
         """
         condition = Expression(where)
 
-        def mark(module: Any, ins: Mapping[str, Any], outs: dict[str, Any]) -> None:
+        def mark(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
             seen = {name: values for name, values in ins.items() if name not in unknown}
             if pdal_env.flags_inside_classification(ins, module.get("metadata")):
                 seen["Classification"] = seen["Classification"] & np.uint8(LEGACY_LIMIT)
@@ -360,9 +360,9 @@ class Callbacks:
 
         return self.filter(mark, {SELECTED: "uint8_t"})
 
-    def check_ground(self, stages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    def check_ground(self, stages: Sequence[StageJson]) -> list[StageJson]:
         """Return the stages, with a check before those that crash old PDAL without ground."""
-        out: list[dict[str, Any]] = []
+        out: list[StageJson] = []
         for stage in stages:
             if stage["type"] in NEEDS_GROUND and pdal_env.needs_ground_check():
                 stage = dict(stage)
@@ -374,7 +374,7 @@ class Callbacks:
 
 
 def _check_ground(
-    where: str, module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]
+    where: str, module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
 ) -> None:
     """Refuse points of which none has class 2."""
     codes = ins.get("Classification")

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from ..base.errors import PipelineError, StageError
+from ..base.json_types import JsonObject, StageJson
 from ..base.las import (
     PROJECTION,
     header_there,
@@ -86,7 +86,7 @@ def described(reference: str) -> tuple[str, frozenset[str]]:
 _POINT = "([1, 2], [1, 2], [1, 2])"
 
 
-def _wkt_and_plane(srs: Mapping[str, Any]) -> tuple[str, frozenset[str]]:
+def _wkt_and_plane(srs: JsonObject) -> tuple[str, frozenset[str]]:
     words = str(srs.get("proj4") or "").split()
     return wkt_of(srs), frozenset(w for w in words if w not in _ALIKE and not _ASIDE.match(w))
 
@@ -172,7 +172,7 @@ def _text(data: bytes) -> str:
     return data.split(b"\0")[0].decode("utf-8", "replace").strip()
 
 
-def text_of(reader: Mapping[str, Any]) -> tuple[str, str]:
+def text_of(reader: StageJson) -> tuple[str, str]:
     """Return the well-known text of the reference of what a reader reads, and a message about it.
 
     Of LAS files it is what their records say, or the reader's ``override_srs`` or
@@ -188,7 +188,7 @@ def text_of(reader: Mapping[str, Any]) -> tuple[str, str]:
     return (described(str(named))[0] if named else wkt), note
 
 
-def reference_of(reader: Mapping[str, Any], horizontal: str = "", vertical: str = "") -> Reference:
+def reference_of(reader: StageJson, horizontal: str = "", vertical: str = "") -> Reference:
     """Return the reference of what a reader reads; see :func:`text_of`.
 
     `horizontal` and `vertical` override the unit of x and y, and of z.
@@ -294,14 +294,14 @@ def check_one_reference(references: Mapping[str, Reference]) -> list[str]:
     return [f"{listed} {has} {NO_REFERENCE} {taken} assumed to have that of the other inputs"]
 
 
-def check_readers(stages: list[dict[str, Any]], horizontal: str = "") -> list[str]:
+def check_readers(stages: list[StageJson], horizontal: str = "") -> list[str]:
     """Refuse a pipeline whose LAS readers read different references; return messages.
 
     A pipeline with a stage that moves points (:data:`MOVING`) is not checked.
     """
     if any(stage["type"] in MOVING for stage in stages):
         return []
-    kinds: dict[str, dict[str, Any]] = {}  # PDAL is asked once for equal references
+    kinds: dict[str, StageJson] = {}  # PDAL is asked once for equal references
     kind_of: dict[str, str] = {}
     for stage in stages:
         options = {k: v for k, v in stage.items() if k not in ("tag", "inputs", "filename")}

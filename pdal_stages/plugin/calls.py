@@ -13,9 +13,11 @@ import signal
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+
+from numpy.typing import NDArray
 
 from ..base.errors import StageError
+from ..base.json_types import JsonObject, StageJson
 from ..base.version import __version__
 from ..pipeline import expansion, pdal_facts, runtime
 from ..stages.base import Stage, StageContext
@@ -23,7 +25,7 @@ from ..stages.registry import place, stage_from, stage_type, stage_types
 from . import declarations
 
 
-def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any]) -> bool:
+def answer(module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> bool:
     """Answer one call; always True.
 
     Parameters
@@ -60,7 +62,7 @@ def answer(module: dict[str, Any], ins: Mapping[str, Any], outs: dict[str, Any])
     return True
 
 
-def _make_stage(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
+def _make_stage(question: JsonObject) -> tuple[Stage, StageContext]:
     """Return the stage of a call, placed in its pipeline, and its context."""
     kind = stage_type(question["stage"])
     if (question["version"], question["digest"]) != (__version__, declarations.digest(kind)):
@@ -83,7 +85,7 @@ def _make_stage(question: Mapping[str, Any]) -> tuple[Stage, StageContext]:
     return stage, StageContext(created_before)
 
 
-def _stages(text: str) -> list[dict[str, Any]]:
+def _stages(text: str) -> list[StageJson]:
     """Return the pipeline up to the stage itself; before PDAL 2.9 all its values are text."""
     try:
         stages = json.loads(text)["pipeline"]
@@ -92,7 +94,7 @@ def _stages(text: str) -> list[dict[str, Any]]:
     return stages if isinstance(stages, list) else [stages]
 
 
-def _creates(stage: Mapping[str, Any]) -> Mapping[str, str]:
+def _creates(stage: StageJson) -> Mapping[str, str]:
     """Return the dimensions that an earlier stage creates; of PDAL's stages, only heights."""
     if stage.get("type") not in stage_types():
         return expansion.heights_of(stage)

@@ -19,6 +19,7 @@ from ..accuracy.measures import Accuracy
 from ..accuracy.text import percent
 from ..base.asprs import class_color, class_name
 from ..base.files import write_whole
+from ..base.json_types import JsonObject
 from ..base.messages import plain
 from ..base.version import __version__
 from .pictures import IGNORED, RIGHT, WRONG, embed, error_colors, nice_step, paint, shading, surface
@@ -46,8 +47,8 @@ class Place:
 
     name: str
     xyz: npt.NDArray[np.float64]  #: (n, 3) meters
-    reference: npt.NDArray[Any]  #: (n,) class codes
-    predicted: npt.NDArray[Any]  #: (n,) class codes
+    reference: npt.NDArray  #: (n,) class codes
+    predicted: npt.NDArray  #: (n,) class codes
 
 
 def write_accuracy_report(
@@ -58,7 +59,7 @@ def write_accuracy_report(
     title: str = "Classification accuracy",
     subtitle: str = "",
     importances: Mapping[str, float] | None = None,
-    settings: Mapping[str, Any] | None = None,
+    settings: JsonObject | None = None,
 ) -> Path:
     """Write an accuracy report, whole or not at all, and return the file.
 
@@ -98,14 +99,14 @@ def write_accuracy_report(
     return write_whole(path, page.encode())
 
 
-def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
+def _maps(a: Accuracy, place: Place) -> JsonObject:
     """Return maps of reference, prediction and errors; none of points at one place or in a line."""
     points = np.asarray(place.xyz, dtype=np.float64)
     compared, wrong = a.verdicts(place.reference, place.predicted)
     true, labels = a.merge(place.reference), a.merge(place.predicted)
     width, height = np.ptp(points[:, :2], axis=0)
     n = int(compared.sum())
-    out: dict[str, Any] = {"points": len(points), "compared": n, "maps": []}
+    out: JsonObject = {"points": len(points), "compared": n, "maps": []}
     if min(width, height) < MIN_SIDES * max(width, height) or max(width, height) == 0:
         return out
     x, y, z = points.T
@@ -115,7 +116,7 @@ def _maps(a: Accuracy, place: Place) -> dict[str, Any]:
     length = nice_step(columns * s.pixel / SCALE_PART)
     scale = (100 * length / (columns * s.pixel), f"{length:g} m")
 
-    def picture(heading: str, alt: str, colors: npt.NDArray[np.uint8]) -> dict[str, Any]:
+    def picture(heading: str, alt: str, colors: npt.NDArray[np.uint8]) -> JsonObject:
         return {"heading": heading, "alt": alt, "scale": scale, **embed(paint(s, colors, light))}
 
     alt = f"Map of the errors from above: {wrong.sum():,} of {n:,} compared points are wrong"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import class_color
+from ..base.json_types import JsonObject
 from ..base.units import Units
 from ..base.vector import vector
 from ..objects.attributes import CHECK, SURE
@@ -109,7 +110,7 @@ def _in_unit(name: str, values: NDArray[np.float64], units: Units) -> NDArray[np
 
 def write_objects(
     path: str, objects: Objects, straight: bool, units: Units | None, wkt: str
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write all layers; return the number of objects of each, and the ``files``."""
     layers = object_layers(objects, straight=straight, units=units)
     styles = {name: _style(layer.kind, name) for name, layer in layers.items()}

@@ -11,7 +11,6 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +20,7 @@ from scipy import ndimage
 from ..base.asprs import class_color
 from ..base.errors import StageError
 from ..base.files import write_whole
+from ..base.json_types import JsonObject
 
 #: Colors (red, green, blue) of points with the right class, the wrong one, and not compared.
 RIGHT = (196, 196, 192)
@@ -77,7 +77,7 @@ def png(rgb: npt.NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
-def embed(rgb: npt.NDArray[np.uint8]) -> dict[str, Any]:
+def embed(rgb: npt.NDArray[np.uint8]) -> JsonObject:
     """Return an image for a template: its file as text, and its size in pixels."""
     return {
         "base64": base64.b64encode(png(rgb)).decode("ascii"),

@@ -19,6 +19,7 @@ from ..base.asprs import NOISE
 from ..base.distinct import DistinctPoints
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs, write_json
+from ..base.json_types import JsonObject
 from ..base.las import read_header
 from ..base.messages import one_line, print_messages
 from ..base.vector import vector
@@ -28,7 +29,7 @@ from ..classifier.model_file import STANDARD, find
 from ..pipeline.distinct_files import DistinctFiles
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.point_files import can_read_chunks, read_columns
-from ..pipeline.spatial_reference import check_one_reference, reference_of_file
+from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of_file
 from ..reports.vector_files import Layer, check_target, qml, write_layers
 from ..stages.points import Points
 from .expected_errors import Patches, ReviewCells, cell_side, find_patches
@@ -60,7 +61,7 @@ class Review:
     unit: float = 1.0  #: of the files' coordinates, in which places are reported, meters
 
     @cached_property
-    def tiles(self) -> list[dict[str, Any]]:
+    def tiles(self) -> list[JsonObject]:
         """A row for each file, the one with most expected errors first."""
         n, listed = len(self.files), self.patches.file[: self.listed]
         file = self.cells.place[:, 0]
@@ -82,7 +83,7 @@ class Review:
         return sorted(rows, key=lambda row: (-row["expected"], row["tile"]))
 
     @cached_property
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[JsonObject]:
         """A row for each listed patch."""
         p = self.patches
         return [
@@ -100,7 +101,7 @@ class Review:
             for k in range(self.listed)
         ]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return counts, tiles and the first patches as JSON types."""
         return {
             "version": __version__,
@@ -225,7 +226,9 @@ def read_points(
         yield {"xyz": points.xyz[kept], "codes": codes[kept], **columns}
 
 
-def _points_and_area(files: Sequence[str], references: dict[str, Any]) -> tuple[int, float]:
+def _points_and_area(
+    files: Sequence[str], references: Mapping[str, Reference]
+) -> tuple[int, float]:
     """Return the number of points and the area, m2, that headers of files report."""
     points, area = 0, 0.0
     for path in files:
@@ -288,14 +291,14 @@ def review_layers(review: Review) -> dict[str, Layer]:
     return layers
 
 
-def _columns(rows: Sequence[dict[str, Any]]) -> dict[str, NDArray]:
+def _columns(rows: Sequence[JsonObject]) -> dict[str, NDArray]:
     """Return the columns of a layer from its rows."""
     names = [name for name in (rows[0] if rows else {}) if name not in ("at", "file")]
     types = {name: object if isinstance(rows[0][name], str) else None for name in names}
     return {name: np.array([row[name] for row in rows], types[name]) for name in names}
 
 
-def lines(result: Mapping[str, Any]) -> list[str]:
+def lines(result: JsonObject) -> list[str]:
     """Return the worst tiles and patches of ``Review.to_dict`` as lines of text."""
     points, expected = result["points"], result["expected"]
     percent = 100 * expected / max(points, 1)

@@ -18,6 +18,7 @@ from ..accuracy.text import by_file, summary
 from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION, UNINFORMATIVE
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, whole_files
+from ..base.json_types import JsonObject, StageJson
 from ..base.messages import Report, plain
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
@@ -89,10 +90,10 @@ class AccuracyStage(Stage):
 
     @classmethod
     def from_pipeline(
-        cls, raw_options: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
-    ) -> dict[str, Any]:
+        cls, raw_options: Mapping[str, Any], before: Sequence[StageJson]
+    ) -> JsonObject:
         """Return options that follow from the stages before."""
-        taken: dict[str, Any] = {"files": files_read(before)}
+        taken: JsonObject = {"files": files_read(before)}
         models = [s["model"] for s in before if s.get("type") == ApplyModel.type and "model" in s]
         if models and raw_options.get("dimension", "Classification") == "Classification":
             taken["model"] = models[-1]
@@ -159,9 +160,9 @@ class AccuracyStage(Stage):
 
     def _batches(
         self, parts: Sequence[tuple[str, Points]], sides: Sequence[Sides], accuracy: Accuracy
-    ) -> list[dict[str, Any]]:
+    ) -> list[StageJson]:
         """Return the accuracy within each batch of a network, at its center [WM19 Figure 3]."""
-        out: list[dict[str, Any]] = []
+        out: list[StageJson] = []
         if not self.model_file:
             return out
         model = loaded_model(self.model_file)
@@ -188,10 +189,10 @@ class AccuracyStage(Stage):
         )
         return Sides(reference, predicted, reliability, inside)
 
-    def _rule(self, sides: Sequence[Sides], report: Report) -> dict[str, Any]:
+    def _rule(self, sides: Sequence[Sides], report: Report) -> JsonObject:
         """Return `classes`, `ignore`, `merge` and `names` of :meth:`Accuracy.from_labels`."""
         ignore = None if self.ignore is None else list(self.ignore.codes)
-        rule: dict[str, Any] = {"classes": self.classes or None, "ignore": ignore, "names": None}
+        rule: JsonObject = {"classes": self.classes or None, "ignore": ignore, "names": None}
         rule["merge"] = self.merge
         known: list[int] | None = None
         if self.model_file:
@@ -238,7 +239,7 @@ class AccuracyStage(Stage):
         parts: Sequence[tuple[str, Points]],
         sides: Sequence[Sides],
         accuracy: Accuracy,
-        rule: Mapping[str, Any],
+        rule: JsonObject,
     ) -> None:
         from ..reports.accuracy_page import Place, write_accuracy_report
 
@@ -267,7 +268,7 @@ class AccuracyStage(Stage):
         )
 
 
-def _one_code_system(trained: Sequence[Mapping[str, Any]]) -> bool:
+def _one_code_system(trained: Sequence[StageJson]) -> bool:
     """Return whether labels and codes of a model mean the same.
 
     For instance they differ where label 5 became code 6, and label 8 code 5.

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from ..base.dimensions import (
     probability,
 )
 from ..base.errors import OptionError
+from ..base.json_types import JsonObject, StageJson
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, is_too_flat, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
@@ -164,7 +164,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         return read_calibration(self.model.info, find(self.model_file)).limits(self.keep_sure)
 
     @property
-    def preparation(self) -> list[dict[str, Any]]:
+    def preparation(self) -> list[StageJson]:
         """Return the preprocessing that the model file holds; empty where it holds none."""
         return self.model.info.get("preparation") or []
 
@@ -233,7 +233,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         return unsure if self.rejected_code is None else self.rejected_code
 
     @property
-    def _prediction(self) -> dict[str, Any]:
+    def _prediction(self) -> JsonObject:
         """Return the values of :class:`PredictionOptions`."""
         values = {field.name: getattr(self, field.name) for field in fields(PredictionOptions)}
         return values | {"rejected_code": self._rejected}

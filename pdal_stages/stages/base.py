@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..base.dimensions import CLASSIFICATION, Dimension
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
+from ..base.json_types import JsonObject, StageJson
 from ..base.options import Option, decode_options, option, option_of, parse_options
 from ..base.units import named_unit
 from .options import Selection, ignore_option
@@ -28,7 +29,7 @@ HEIGHTS_OUTSIDE = (
 )
 
 
-def files_read(stages: Sequence[Mapping[str, Any]]) -> list[str]:
+def files_read(stages: Sequence[StageJson]) -> list[str]:
     """Return the files of the readers among stages, as they are written."""
     readers = [stage for stage in stages if str(stage.get("type")).startswith("readers.")]
     return [str(stage["filename"]) for stage in readers if "filename" in stage]
@@ -118,7 +119,7 @@ class Stage(ABC):
     #: Tiles add them up, and `classify` prints them.
     counts: ClassVar[Mapping[str, str]] = {}
     #: Options of the example on its page; needed where an option is required.
-    example: ClassVar[Mapping[str, Any]] = {}
+    example: ClassVar[JsonObject] = {}
     #: Whether it calls :meth:`Points.keep_only`: the next stage gets the points from PDAL anew.
     forgets: ClassVar[bool] = False
     #: Whether points beyond the halo may matter; tiles then call :meth:`reach_of` and read farther.
@@ -141,7 +142,7 @@ class Stage(ABC):
 
     #: The stages before it in the pipeline that create what it reads, as a model's preprocessing
     #: holds them.
-    upstream: tuple[Mapping[str, Any], ...] = ()
+    upstream: tuple[StageJson, ...] = ()
 
     def __init_subclass__(cls, settings: Any = None) -> None:
         """Declare the fields of `settings` as options, but those that the class has already."""
@@ -172,7 +173,7 @@ class Stage(ABC):
             raise AttributeError(f"a stage cannot be changed after it is made: '{name}' is set")
         super().__setattr__(name, value)
 
-    def after(self: _Placed, makers: Iterable[Mapping[str, Any]]) -> _Placed:
+    def after(self: _Placed, makers: Iterable[StageJson]) -> _Placed:
         """Return this stage placed behind the stages of a pipeline that create what it reads."""
         placed = copy.copy(self)
         placed.__dict__["upstream"] = tuple(makers)
@@ -188,7 +189,7 @@ class Stage(ABC):
         return tuple(reversed(options.values()))
 
     @classmethod
-    def complete(cls, raw_options: dict[str, Any]) -> dict[str, Any]:
+    def complete(cls, raw_options: dict[str, Any]) -> JsonObject:
         """Return the options of a user with those that a word among them stands for."""
         return raw_options
 
@@ -274,8 +275,8 @@ class Stage(ABC):
 
     @classmethod
     def from_pipeline(
-        cls, raw_options: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
-    ) -> dict[str, Any]:
+        cls, raw_options: Mapping[str, Any], before: Sequence[StageJson]
+    ) -> JsonObject:
         """Return options that follow from the stages before, where the user does not set them."""
         return {}
 
@@ -317,7 +318,7 @@ class Stage(ABC):
         """
 
     @classmethod
-    def schema(cls) -> dict[str, Any]:
+    def schema(cls) -> JsonObject:
         """Return the JSON Schema of the stage's object in a pipeline."""
         options = cls.all_options()
         shared = {"tag": {"type": "string"}, "inputs": {"type": ["array", "string"]}}

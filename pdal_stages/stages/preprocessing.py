@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from ..base.dimensions import opening_width
 from ..base.errors import ModelError, StageError
+from ..base.json_types import JsonObject, StageJson
 from ..base.las import number_type
 from ..base.selections import split_selection
 from .base import WHOLE_CLOUD
@@ -24,7 +25,7 @@ from .options import Option
 from .registry import PDAL_OWN, stage_type, stage_types
 
 #: The preprocessing of the dimensions that a model is trained on by default.
-PREPARATION: tuple[dict[str, Any], ...] = (
+PREPARATION: tuple[StageJson, ...] = (
     {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17]},
 )
 #: The stage that finds ground, or takes what is given.
@@ -65,22 +66,22 @@ _NOT_STORED = (*PDAL_OWN, "threads", "horizontal_unit", "vertical_unit", "keep_r
 _MAX_CHARACTERS = 2000
 
 
-def entry(stage: Mapping[str, Any]) -> dict[str, Any]:
+def entry(stage: StageJson) -> JsonObject:
     """Return a stage as preprocessing holds it."""
     return {key: value for key, value in stage.items() if key not in _NOT_STORED}
 
 
-def as_json(preparation: Iterable[Mapping[str, Any]]) -> str:
+def as_json(preparation: Iterable[StageJson]) -> str:
     """Return the stages as they are written in a pipeline."""
     return ", ".join(json.dumps(dict(stage), default=str) for stage in preparation)
 
 
-def same(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str, Any]]) -> bool:
+def same(first: Sequence[StageJson], second: Sequence[StageJson]) -> bool:
     """Return whether two lists are the same stages with the same options."""
     return _normalize(first) == _normalize(second)
 
 
-def _normalize(stages: Sequence[Mapping[str, Any]]) -> list[Any]:
+def _normalize(stages: Sequence[StageJson]) -> list[Any]:
     """Return the stages in one spelling where a model could carry them, else as they are."""
     try:
         return check(stages)
@@ -88,13 +89,13 @@ def _normalize(stages: Sequence[Mapping[str, Any]]) -> list[Any]:
         return list(stages)
 
 
-def algorithm_versions(preparation: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+def algorithm_versions(preparation: Iterable[StageJson]) -> dict[str, int]:
     """Return type -> version of the algorithm in this release; PDAL's stages have none."""
     types = [str(stage["type"]) for stage in preparation]
     return {kind: stage_type(kind).algorithm_version for kind in types if kind in stage_types()}
 
 
-def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def check(preparation: Sequence[StageJson]) -> list[StageJson]:
     """Return the preprocessing in one spelling, if a model may carry it.
 
     Raises
@@ -114,7 +115,7 @@ def check(preparation: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         raise
 
 
-def _check_stage(stage: Mapping[str, Any]) -> dict[str, Any]:
+def _check_stage(stage: StageJson) -> StageJson:
     """Return a stage in one spelling, if a model may carry it."""
     kind = str(stage["type"])
     ours = stage_types().get(kind)
@@ -152,7 +153,7 @@ def _number(value: float) -> int | float:
     return int(value) if value == int(value) else value
 
 
-def with_given_ground(preparation: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def with_given_ground(preparation: Iterable[StageJson]) -> list[StageJson]:
     """Return preprocessing in which class 2 is the ground, and Ground tells what is near it."""
     options = {"ground": True, "given_ground": True}
     return [
@@ -160,25 +161,25 @@ def with_given_ground(preparation: Iterable[Mapping[str, Any]]) -> list[dict[str
     ]
 
 
-def preparation_of(names: Iterable[str]) -> list[dict[str, Any]]:
+def preparation_of(names: Iterable[str]) -> list[StageJson]:
     """Return the stage that creates these dimensions, as far as they are heights."""
     wanted = list(names)
     openings = [_number(width) for width in map(opening_width, wanted) if width is not None]
     if not openings and "Ground" not in wanted:
         return [{"type": "filters.hag_minima"}] if "HeightAboveGround" in wanted else []
-    stage: dict[str, Any] = {"type": "filters.hag_morphological"}
+    stage: StageJson = {"type": "filters.hag_morphological"}
     if "Ground" in wanted:
         stage["ground"] = True
     return [{**stage, "openings": sorted(openings)}] if openings else [stage]
 
 
 def made_of_coordinates(
-    preparation: Sequence[Mapping[str, Any]],
+    preparation: Sequence[StageJson],
     xyz: npt.NDArray[np.float64],
     usable: npt.NDArray[np.bool_] | None = None,
     threads: int | None = None,
     classes: npt.NDArray[np.uint8] | None = None,
-) -> dict[str, npt.NDArray[Any]]:
+) -> dict[str, npt.NDArray]:
     """Compute the dimensions that a model reads from coordinates, without PDAL.
 
     Parameters

@@ -13,9 +13,9 @@ import re
 from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from ..base.errors import PipelineError, StageError, suggest
+from ..base.json_types import StageJson
 from .base import Stage
 
 #: The group of entry points in which other packages declare their stages.
@@ -127,7 +127,7 @@ def place(type_name: str, tag: str | None) -> str:
     return f"{type_name} (tag '{tag}')" if tag else type_name
 
 
-def stage_from(stage: Mapping[str, Any]) -> Stage:
+def stage_from(stage: StageJson) -> Stage:
     """Make a stage of ours from its object in a pipeline."""
     options = {name: value for name, value in stage.items() if name not in ("type", *PDAL_OWN)}
     return stage_type(stage["type"])(options, place(stage["type"], stage.get("tag")))

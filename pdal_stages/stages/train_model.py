@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..base.distinct import DistinctPoints
 from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
+from ..base.json_types import JsonObject, StageJson
 from ..base.messages import Report
 from ..classifier import model_description
 from ..classifier.calibration import calibrate_on_base
@@ -99,14 +100,14 @@ class TrainModel(Stage, settings=TrainingOptions):
         )
 
     @classmethod
-    def complete(cls, raw_options: dict[str, Any]) -> dict[str, Any]:
+    def complete(cls, raw_options: dict[str, Any]) -> JsonObject:
         """Return the options with those of the recipe that they name."""
         return with_recipe(raw_options)
 
     @classmethod
     def from_pipeline(
-        cls, raw_options: Mapping[str, Any], before: Sequence[Mapping[str, Any]]
-    ) -> dict[str, Any]:
+        cls, raw_options: Mapping[str, Any], before: Sequence[StageJson]
+    ) -> JsonObject:
         """Return options that follow from the stages before."""
         return {"files": files_read(before)}
 

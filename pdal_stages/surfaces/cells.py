@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.asprs import NOISE, TERRAIN, WIRES_AND_TOWERS
 from ..base.grid import GridWindow, begins_run, cell_numbers
+from ..base.json_types import JsonObject
 from ..tiling.options import LARGEST_TILE, TILE_POINT, Density
 from ..tiling.tile_records import Part
 
@@ -67,7 +67,7 @@ def steps(coordinate: NDArray) -> Integers:
 
 def reduce_points(
     parts: Sequence[Part], options: SurfaceOptions, unit: float
-) -> tuple[dict[str, NDArray], dict[str, Any]]:
+) -> tuple[dict[str, NDArray], JsonObject]:
     """Reduce points of a tile (files and their dimensions) to cells.
 
     Noise and withheld points are left out. `unit` is that of the coordinates, in meters.

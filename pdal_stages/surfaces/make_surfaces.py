@@ -15,6 +15,7 @@ from ..base.errors import StageError, optional_import
 from ..base.files import Output, check_outputs
 from ..base.geotiff import rasterio
 from ..base.grid import GridWindow
+from ..base.json_types import JsonObject
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.inputs import Survey
 from ..tiling.options import Density, TilingOptions
@@ -52,7 +53,7 @@ def write_surfaces(
     options: SurfaceOptions | None = None,
     tiling: TilingOptions | None = None,
     progress: bool | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write ``terrain.tif``, ``surface.tif`` and ``canopy.tif`` of classified files.
 
     Parameters
@@ -90,7 +91,7 @@ def write_surfaces(
         return _run(run, paths, options)
 
 
-def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> dict[str, Any]:
+def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> JsonObject:
     """Compute all tiles, and write the rasters."""
     survey = run.survey
     reduce = partial(reduce_points, options=options, unit=survey.unit)

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from ..base.errors import optional_import
 from ..base.grid import GridWindow
+from ..base.json_types import JsonObject
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.options import Box, TileGrid, touching
 from ..tiling.tile_records import Tile, cells_in_tile
@@ -82,7 +83,7 @@ class TileCells:
         return out[0], out[1]
 
 
-def compute_tile(cells: TileCells, tile: Tile, target: str) -> dict[str, Any]:
+def compute_tile(cells: TileCells, tile: Tile, target: str) -> JsonObject:
     """Compute the rasters of a tile, save them, and return how many cells of each are known.
 
     The arrays are named as in :data:`RASTERS`, (rows, columns) float32 from the south with NaN for

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..base.grid import GridWindow
+from ..base.json_types import JsonObject
 from ..base.messages import count_of
 from ..reports import pictures
 from ..reports.accuracy_page import render_page
@@ -46,7 +45,7 @@ class Rasters:
     voids: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
 
 
-def render_report(result: Mapping[str, Any], rasters: Rasters) -> str:
+def render_report(result: JsonObject, rasters: Rasters) -> str:
     """Return the page."""
     top, side = rasters.of["picture"][1], rasters.rules.picture
     top = np.pad(top, 1, constant_values=EMPTY)  # a single row has no slope to be shaded
@@ -98,7 +97,7 @@ def _strips(rasters: Rasters) -> NDArray[np.uint8]:
         return pictures.ramp(np.sqrt(total / cells) * scale, _DIFFERENCES, (0.0, _LARGE))
 
 
-def _view(heading: str, colors: NDArray[np.uint8], pixel_m: float) -> dict[str, Any]:
+def _view(heading: str, colors: NDArray[np.uint8], pixel_m: float) -> JsonObject:
     """Return a picture for the template, enlarged where it is small."""
     times = max(1, _LEAST // colors.shape[1])
     colors = colors.repeat(times, axis=0).repeat(times, axis=1)

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from ..base.asprs import NOISE, OVERLAP, TERRAIN, WATER
 from ..base.distinct import DistinctPoints
 from ..base.grid import GridWindow, cell_numbers
+from ..base.json_types import JsonObject
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.tile_records import Part
 from .cells import EMPTY, STEPS, Integers, steps
@@ -41,7 +41,7 @@ class ReportRules:
         return {"density": self.density, "void": self.void, "picture": self.picture}
 
 
-def describe(part: Mapping[str, NDArray]) -> dict[str, Any]:
+def describe(part: Mapping[str, NDArray]) -> JsonObject:
     """Return counts, and extents of x, y, z and times, of points as JSON types."""
     codes = part["Classification"]
     overlap = part["Overlap"] != 0 if "Overlap" in part else codes == OVERLAP
@@ -57,7 +57,7 @@ def describe(part: Mapping[str, NDArray]) -> dict[str, Any]:
     return {"counts": counts, "extent": extent}
 
 
-def combine(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def combine(parts: Sequence[JsonObject]) -> JsonObject:
     """Return the description of several parts (:func:`describe`) together."""
     low, high = (pick([part["extent"] for part in parts], axis=0) for pick in (np.min, np.max))
     extent = np.column_stack([low[:, 0], high[:, 1]]).tolist()
@@ -67,9 +67,9 @@ def combine(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"counts": counts, "extent": extent}
 
 
-def figures_of(part: Mapping[str, Any]) -> dict[str, Any]:
+def figures_of(part: JsonObject) -> JsonObject:
     """Return a description as it is reported: counts by class, return and source, in order."""
-    out: dict[str, Any] = {"classes": {}, "returns": {}, "sources": {}}
+    out: JsonObject = {"classes": {}, "returns": {}, "sources": {}}
     for key, count in sorted(part["counts"].items(), key=lambda item: (len(item[0]), item[0])):
         name, _, value = key.partition(" ")
         out |= {name: {**out[name], value: count} if value else count}
@@ -89,7 +89,7 @@ def _is_last(part: Mapping[str, NDArray]) -> NDArray[np.bool_]:
 
 def reduce_for_report(
     parts: Sequence[Part], rules: ReportRules, control: NDArray[np.float64]
-) -> tuple[dict[str, NDArray], dict[str, Any]]:
+) -> tuple[dict[str, NDArray], JsonObject]:
     """Reduce points of a tile: files and their dimensions.
 
     Returns

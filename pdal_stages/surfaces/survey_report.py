@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from ..base import checks
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, write_json, write_whole
 from ..base.grid import GridWindow
+from ..base.json_types import JsonObject
 from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.jobs import Job
@@ -51,7 +52,7 @@ def write_report(
     control: str = "",
     tiling: TilingOptions | None = None,
     progress: bool | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write the report of a survey as an HTML page, and return it as JSON types.
 
     Parameters
@@ -112,7 +113,7 @@ def read_control(path: str) -> list[Control]:
 
 def _measure(
     run: RecordRun, ordered: float, void: float, control: Sequence[Control]
-) -> tuple[dict[str, Any], Rasters]:
+) -> tuple[JsonObject, Rasters]:
     """Reduce all tiles; return the figures, and rasters to draw."""
     survey, unit = run.survey, run.survey.unit
     units = survey.reference.units
@@ -165,7 +166,7 @@ def _merge(run: RecordRun, jobs: Sequence[Job], name: str) -> tuple[GridWindow, 
     return whole, out
 
 
-def _density(rasters: Rasters, ordered: float) -> dict[str, Any]:
+def _density(rasters: Rasters, ordered: float) -> JsonObject:
     """Return figures of density and voids.
 
     A cell of density counts if it and its eight neighbors have points, as those at the border are
@@ -180,7 +181,7 @@ def _density(rasters: Rasters, ordered: float) -> dict[str, Any]:
     inside = inside[2:-2, 2:-2] | (held > 0)
     label, count = ndimage.label(inside & (held == 0), np.ones((3, 3)))
     area = float(inside.sum() * cell_m**2)
-    density: dict[str, Any] = {"cell_m": side_m, "cells": int(inner.sum()), "ordered": ordered}
+    density: JsonObject = {"cell_m": side_m, "cells": int(inner.sum()), "ordered": ordered}
     for name, points in (("all", all_points), ("last", last)):
         each = points[inner] / side_m**2
         known, judged = len(each) > 0, ordered > 0 and len(each) > 0
@@ -197,7 +198,7 @@ def _density(rasters: Rasters, ordered: float) -> dict[str, Any]:
     rasters.voids = is_void[label]
     sizes = np.bincount(label[rasters.voids], minlength=count + 1) * cell_m**2
     middles = ndimage.center_of_mass(label > 0, label, np.flatnonzero(is_void))
-    voids: list[dict[str, Any]] = []
+    voids: list[JsonObject] = []
     for area_m2, (row, column) in zip(sizes[is_void], middles, strict=True):
         cell = window.left + column, window.bottom + row
         at = [round((number + 0.5) * rasters.rules.void, 2) for number in cell]
@@ -210,7 +211,7 @@ def _density(rasters: Rasters, ordered: float) -> dict[str, Any]:
 
 def _strips(
     run: RecordRun, jobs: Sequence[Job], rules: ReportRules, vertical: float
-) -> tuple[list[dict[str, Any]], NDArray[np.int64]]:
+) -> tuple[list[JsonObject], NDArray[np.int64]]:
     """Compare the ground of strips; return pairs, worst first, and cells of density with errors."""
 
     def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Any]:
@@ -221,7 +222,7 @@ def _strips(
     compared = run.compute("strips", jobs, tiles, 2 * rules.strip, compute)
     loaded = run.arrays(compared, "differences", "cells")
     rows = np.concatenate([arrays["differences"] for arrays in loaded])
-    pairs: list[dict[str, Any]] = []
+    pairs: list[JsonObject] = []
     for a, b in np.unique(rows[:, :2], axis=0).tolist():
         value, count = rows[(rows[:, 0] == a) & (rows[:, 1] == b)][:, 2:].T
         order = np.argsort(value, kind="stable")
@@ -240,12 +241,12 @@ def _control(
     control: Sequence[Control],
     rules: ReportRules,
     vertical: float,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Compare the terrain, through all ground points, with control points."""
     near_any = [arrays["control"] for arrays in run.arrays(jobs, "control")]
     ground = lowest(np.concatenate(near_any), 1.0)  # one of points at the same place
     reach, everywhere = rules.around_control * STEPS, (math.inf, math.inf, -math.inf, -math.inf)
-    rows: list[dict[str, Any]] = []
+    rows: list[JsonObject] = []
     outside = []
     for x, y, z, name in control:
         place = np.array([x, y]) * STEPS
@@ -258,7 +259,7 @@ def _control(
             outside.append(name)
     errors = np.array([row["difference_m"] for row in rows])
     rows.sort(key=lambda row: -abs(row["difference_m"]))
-    out: dict[str, Any] = {"points": len(rows), "outside": outside, "worst": rows[:_LISTED]}
+    out: JsonObject = {"points": len(rows), "outside": outside, "worst": rows[:_LISTED]}
     if rows:
         rmse = float(np.sqrt((errors**2).mean()))
         out |= {"mean_m": float(errors.mean()), "rmse_m": rmse, "nssda_95_m": NSSDA * rmse}
@@ -270,7 +271,7 @@ def _all_of(points: NDArray[np.int64], distance: float) -> NDArray[np.int64]:
     return points
 
 
-def lines(result: Mapping[str, Any]) -> list[str]:
+def lines(result: JsonObject) -> list[str]:
     """Return what the command prints of a report."""
     density, voids, control = result["density"], result["voids"], result["control"]
     out = [

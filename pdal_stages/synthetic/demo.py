@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..base.files import write_json
+from ..base.json_types import StageJson
 from ..classifier.model_file import STANDARD
 from ..stages.preprocessing import PREPARATION
 
@@ -65,7 +65,7 @@ def run_demo(
         print(f"  {folder / file}")
 
 
-def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[dict[str, Any]]]:
+def pipelines(folder: Path, middle: float, seed: int) -> dict[str, list[StageJson]]:
     """Return the pipelines ``train``, ``classify``, ``standard`` of a town, divided at an X."""
     town = {"type": "readers.las", "filename": str(folder / "town.laz")}
     las = {"type": "writers.las", "forward": "all", "extra_dims": "all"}

@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.dimensions import opening
 from ..base.grid import GridWindow
+from ..base.json_types import JsonObject
 from .cells import HIGHEST, columns, usable
 from .filter_options import FilterOptions, Keep
 from .ground_blocks import GroundCells
@@ -76,7 +77,7 @@ def filtered_ground(
     mask: ArrayLike | None = None,
     ground: ArrayLike | None = None,
     cells: GroundCells | None = None,
-    figures: dict[str, Any] | None = None,
+    figures: JsonObject | None = None,
     **options: Any,
 ) -> dict[str, NDArray]:
     """Compute heights above the ground that a simple morphological filter finds.

@@ -12,7 +12,6 @@ multi-class classification for object extraction from airborne laser scanning po
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..base import checks
 from ..base.errors import NoTerrainError, OptionError
 from ..base.grid import cell_keys, cell_numbers, places_among
+from ..base.json_types import JsonObject
 from .cells import columns, usable
 
 
@@ -76,7 +76,7 @@ def hag_minima(
     resolution: float = 0.5,
     mask: ArrayLike | None = None,
     wanted: ArrayLike | None = None,
-    figures: dict[str, Any] | None = None,
+    figures: JsonObject | None = None,
 ) -> NDArray[np.float64]:
     """Compute the height of every point above the coarse terrain of the cloud [W18 section 3.2].
 

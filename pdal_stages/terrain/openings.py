@@ -48,8 +48,8 @@ def _steps(radius: int) -> tuple[int, int]:
 
 
 def highest_around(
-    raster: NDArray[Any], squares: int, diamonds: int, threads: int | None = 1
-) -> NDArray[Any]:
+    raster: NDArray, squares: int, diamonds: int, threads: int | None = 1
+) -> NDArray:
     """Return the maximum (h, w) over these numbers of squares and diamonds around each cell.
 
     A thread takes some rows with those around that matter: what it works on stays in its cache.
@@ -67,7 +67,7 @@ def highest_around(
     return out
 
 
-def _highest_of_rows(raster: NDArray[Any], least: Any, squares: int, diamonds: int) -> NDArray[Any]:
+def _highest_of_rows(raster: NDArray, least: Any, squares: int, diamonds: int) -> NDArray:
     """Return the maximum (h, w) around each cell of some rows; outside them is the `least` value.
 
     Each line of an octagon is a running maximum on the flat raster with a margin round it, by
@@ -92,7 +92,7 @@ def _highest_of_rows(raster: NDArray[Any], least: Any, squares: int, diamonds: i
     start = pad * (stride + 1) - squares * (stride + 1) - max(diamonds - 1, 0) * stride
     size = (h - 1) * stride + w
 
-    def shifted(by: int) -> NDArray[Any]:
+    def shifted(by: int) -> NDArray:
         return values[start + by : start + by + size]
 
     out = shifted(0)

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.grid import places_among
+from ..base.json_types import JsonObject, StageJson
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import ExpandedStage
 from ..stages.base import FarReaching, inside_block
@@ -41,7 +42,7 @@ def ready_stages(context: RunContext) -> list[ExpandedStage | None]:
     return _ready[context.scratch]
 
 
-def with_threads(step: dict[str, Any], threads: int) -> dict[str, Any]:
+def with_threads(step: StageJson, threads: int) -> JsonObject:
     """Return a stage that uses no more threads than its worker has."""
     if step["type"] not in stage_types():
         return dict(step)
@@ -69,7 +70,7 @@ def block_name(block: tuple[int, int]) -> str:
 
 def make_block(
     context: RunContext, block: tuple[int, int], squares: Sequence[str], target: str
-) -> dict[str, Any]:
+) -> JsonObject:
     """Save a block of the raster, computed from the files of squares around it; return a record."""
     blocks = context.plan.blocks
     assert blocks is not None

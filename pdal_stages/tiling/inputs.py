@@ -7,7 +7,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..base import las, las_check
 from ..base.errors import PipelineError, StageError
 from ..base.hashing import digest_of_file, fingerprint
+from ..base.json_types import JsonObject, StageJson
 from ..base.units import Units
 from ..pipeline.inputs_outputs import LAS_READERS, locations
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
@@ -52,7 +53,7 @@ class CloudIndex:
     copy: str = ""  #: the file with the points; empty where an earlier run had it
 
     @classmethod
-    def parse(cls, record: dict[str, Any], copy: str = "") -> CloudIndex:
+    def parse(cls, record: JsonObject, copy: str = "") -> CloudIndex:
         """Return the index that :func:`sort_points` has described."""
         cells = np.array(record["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in record["tiles"]]
@@ -80,7 +81,7 @@ class InputSource:
     """One input, a LAS, LAZ or COPC file, and what is known of it."""
 
     path: str  #: absolute
-    reader: dict[str, Any]  #: the stage that reads it, without the file's name
+    reader: StageJson  #: the stage that reads it, without the file's name
     extent: Extent | None = None  #: None where the header cannot be read
     stamp: Sequence[int] = ()  #: size and time at the start of the run
     fault: str = ""  #: why it cannot be read
@@ -104,7 +105,7 @@ class InputSource:
         return [self.path, self.reader, self.index.digest if self.index else self.stamp]
 
 
-def find_sources(readers: list[dict[str, Any]]) -> list[InputSource]:
+def find_sources(readers: list[StageJson]) -> list[InputSource]:
     """Return the inputs of readers: names, patterns, tile indexes; refuse other readers."""
     sources: dict[str, InputSource] = {}
     for reader in readers:
@@ -155,7 +156,7 @@ class Survey:
     """The inputs of a run, and its options with tile size and number of workers decided."""
 
     def __init__(
-        self, plan: TilePlan, options: TilingOptions, earlier: Mapping[str, Any] | None = None
+        self, plan: TilePlan, options: TilingOptions, earlier: JsonObject | None = None
     ) -> None:
         """Find and check the inputs, and choose tiles.
 
@@ -263,7 +264,7 @@ class Survey:
         self.bounds: Box = union(self._boxes)
 
     @cached_property
-    def _contents(self) -> dict[str, Any]:
+    def _contents(self) -> JsonObject:
         """Return the digests of the files that stages read; a folder has its size and time.
 
         A run that is only planned (``--dry-run``) does not read them.
@@ -312,7 +313,7 @@ class Survey:
         check_number(len(counts), f"tiles of {self.grid.size:g}")
         return dict(sorted(counts.items(), key=lambda item: (item[0][1], item[0][0])))
 
-    def figures(self, plan: TilePlan) -> dict[str, Any]:
+    def figures(self, plan: TilePlan) -> JsonObject:
         """Return what the report tells about the pipeline, its models, the inputs and the tiles."""
         return {
             "pipeline": plan.name,
@@ -353,7 +354,7 @@ def stamp(path: str | os.PathLike) -> list[int]:
     return [status.st_size, status.st_mtime_ns]
 
 
-def one_format(paths: Sequence[str]) -> dict[str, Any]:
+def one_format(paths: Sequence[str]) -> StageJson:
     """Return options of ``writers.las`` for the points of all inputs; empty for LAS of one form.
 
     The finest scale of each axis with its offset, and the first format of LAS 1.4 with all colors

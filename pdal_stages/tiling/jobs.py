@@ -22,6 +22,7 @@ from ..base.checks import strict_json
 from ..base.errors import StageError
 from ..base.files import make_own_folder, try_lock, whole_files
 from ..base.hashing import digest_of_file
+from ..base.json_types import JsonObject
 from ..base.messages import count_of
 from ..base.version import __version__
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR
@@ -57,7 +58,7 @@ class Job:
     state: str = "waiting"
     #: The result of its task, as saved in the work folder: counts, messages, outputs, cost,
     #: fingerprint.
-    record: dict[str, Any] = field(default_factory=dict)
+    record: JsonObject = field(default_factory=dict)
     reason: str = ""  #: why it failed
     blocked: bool = False  #: an unreadable input is the reason
 
@@ -75,7 +76,7 @@ class Job:
         if reason := next((job.reason for job in needed if job.reason), ""):
             self.fail(reason)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return what a report tells of it, as of all jobs."""
         reason = {"reason": self.reason} if self.reason else {}
         known = {k: v for k, v in self.record.items() if k not in ("fingerprint", "outputs")}
@@ -99,9 +100,9 @@ class TiledRun:
     unreadable: dict[str, str]  #: unreadable inputs, and why
     changed: list[str]  #: files that changed during the run
     messages: list[str]  #: what the user should know
-    summary: dict[str, Any]  #: figures for people; see :meth:`to_dict`
+    summary: JsonObject  #: figures for people; see :meth:`to_dict`
     #: PDAL's, of a run in one piece, which has no tiles
-    metadata: dict[str, Any] | None = None
+    metadata: JsonObject | None = None
 
     @property
     def failures(self) -> list[tuple[str, str]]:
@@ -114,7 +115,7 @@ class TiledRun:
             *((what, job.reason) for what, job in jobs if job.reason and not job.blocked),
         ]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return a JSON-able report."""
         return {
             "pdal_stages": __version__,
@@ -136,7 +137,7 @@ class TiledRun:
 
 def summarize(
     tiles: list[Job], squares: list[Job], cpu_seconds: float, seconds: float
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the figures of all tiles and squares of rounds, for :attr:`TiledRun.summary`."""
     worked = [job.record for job in tiles if job.state == "done"]
     classes: Counter[str] = Counter()
@@ -257,7 +258,7 @@ class Store:
         """Return the path of a file of arrays."""
         return str(self.kept / f"{name}{_ARRAYS}")
 
-    def finish(self, name: str, digest: str, record: Mapping[str, Any]) -> None:
+    def finish(self, name: str, digest: str, record: JsonObject) -> None:
         """Save the record of a finished job.
 
         `digest` is the fingerprint of everything that affects it.
@@ -270,7 +271,7 @@ class Store:
         """Remove the record of a job that runs again: it must not match a newer file."""
         self._note(name).unlink(missing_ok=True)
 
-    def note(self, name: str) -> dict[str, Any]:
+    def note(self, name: str) -> JsonObject:
         """Return the record of a finished job with its fingerprint; empty without one."""
         try:
             record = strict_json(self._note(name).read_bytes())
@@ -278,7 +279,7 @@ class Store:
         except (OSError, ValueError, RecursionError):
             return {}
 
-    def finished(self, name: str, digest: str) -> dict[str, Any] | None:
+    def finished(self, name: str, digest: str) -> JsonObject | None:
         """Return the record of a job if `digest` matches and the files it wrote are unchanged."""
         record = self.note(name)
         with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..base.distinct import DistinctPoints
 from ..base.errors import OptionError
 from ..base.files import JSON, Output, check_outputs, write_json
+from ..base.json_types import JsonObject
 from ..base.messages import one_line, print_messages
 from ..base.units import Units
 from ..base.version import __version__
@@ -38,7 +39,7 @@ LARGEST_CELL = 4.0
 
 def objects_of_files(
     names: Sequence[str], stage: WriteObjects, workers: int = 1, metadata: str | None = None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Find objects in classified files, write and print them; return the files, counts by kind."""
     inputs = input_files(names)
     more = [Output(metadata, "metadata", JSON)] if metadata else []

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
+from ..base.json_types import StageJson
 from ..classifier.model_file import shipped
 from ..pipeline.copies import read_here
 from ..pipeline.expansion import stage_files
@@ -71,11 +72,11 @@ class Round:
 class TilePlan:
     """The plan of a tiled run."""
 
-    readers: list[dict[str, Any]]  #: as written
-    head: list[dict[str, Any]]  #: stages that see neighbors: run on a tile and its halo
+    readers: list[StageJson]  #: as written
+    head: list[StageJson]  #: stages that see neighbors: run on a tile and its halo
     rounds: list[Round]  #: the head in parts; the last one, which may be empty, runs on the tiles
     #: Stages that process single points, and the writers: run on the points of one output.
-    tail: list[dict[str, Any]]
+    tail: list[StageJson]
     #: Files that each stage reads, of the head and then of the tail: models, maps and more.
     files: list[list[str]]
     sees_m: float  #: meters around a tile within which points may matter
@@ -94,7 +95,7 @@ class TilePlan:
     copied: bool = False  #: outputs are copies of inputs, without PDAL
 
     @property
-    def writers(self) -> list[dict[str, Any]]:
+    def writers(self) -> list[StageJson]:
         """Return the stages that write files."""
         return [s for s in self.tail if s["type"].startswith("writers.")]
 
@@ -225,7 +226,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
 
 def plan_of_files(
     files: Sequence[str],
-    stages: Sequence[dict[str, Any]],
+    stages: Sequence[StageJson],
     overrides: Iterable[Override],
     buffer: float | None = None,
 ) -> tuple[TilePlan, Pipeline]:
@@ -360,7 +361,7 @@ def _check_local(step: _Step, in_head: bool, buffer: float | None) -> None:
         )
 
 
-def _for_workers(step: _Step) -> dict[str, Any]:
+def _for_workers(step: _Step) -> StageJson:
     """Return a stage of the head with absolute paths, which every worker finds.
 
     A shipped model keeps its name, as its path differs between hosts.

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import NoTerrainError, PipelineError
+from ..base.json_types import JsonObject, StageJson
 from ..base.las_copy import LasCopy
 from ..base.las_points import RecordColumns, SomeRows
 from ..base.messages import shorten
@@ -161,16 +162,16 @@ class _RoundRun:
     def _box(self, halo_units: float = 0.0) -> Box:
         return self.context.grid_of(self.number).box(self.tile, halo_units)
 
-    def _stages_here(self) -> list[dict[str, Any]]:
+    def _stages_here(self) -> list[StageJson]:
         """Return the pipeline of a round that runs without PDAL: a reader and the steps."""
         part = self.context.plan.rounds[self.number]
-        stages: list[dict[str, Any]] = [{**self.pieces[0].reader, "filename": "piece.las"}]
+        stages: list[StageJson] = [{**self.pieces[0].reader, "filename": "piece.las"}]
         for number in range(part.begin, part.end):
             self.steps[len(stages)] = number
             stages.append(with_threads(self.context.plan.head[number], self.context.threads))
         return stages
 
-    def _stages(self, origins: Sequence[Mapping[str, NDArray]]) -> list[dict[str, Any]]:
+    def _stages(self, origins: Sequence[Mapping[str, NDArray]]) -> list[StageJson]:
         """Return the pipeline of a round with PDAL's filters.
 
         It reads pieces that are written for it, with their origin as extra bytes, runs the steps,
@@ -243,7 +244,7 @@ def _concatenate_by_name(parts: Sequence[Mapping[str, NDArray]]) -> dict[str, ND
     }
 
 
-def _merges(stage: Mapping[str, Any]) -> bool:
+def _merges(stage: StageJson) -> bool:
     """Return whether a stage sees the points of all files together."""
     return stage["type"] in ("filters.merge", *stage_types())
 
@@ -366,7 +367,7 @@ def run_tile(
     complete_m: float,
     target: str,
     outputs: list[str] | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Run a round on a tile, or on a larger square; save the results or write the outputs.
 
     Parameters
@@ -455,7 +456,7 @@ def _describe(halo: _TileHalo, pieces: list[Piece], result: RoundResult) -> Tile
     )
 
 
-def _save(halo: _TileHalo, result: RoundResult, target: str) -> dict[str, Any]:
+def _save(halo: _TileHalo, result: RoundResult, target: str) -> JsonObject:
     """Save what the next round, or an output, needs; return the file in a record."""
     plan = halo.context.plan
     part, arrays = plan.rounds[halo.number], arrays_of(result.results)

@@ -12,7 +12,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from ..base.files import whole_files
 from ..base.grid import begins_run
 from ..base.hashing import digest_of_file
+from ..base.json_types import JsonObject, StageJson
 from ..base.las_points import Layout, read_records
 from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource
@@ -46,7 +46,7 @@ def _copy_type(layout: Layout) -> np.dtype:
     return np.dtype([("number", "<i8"), ("record", layout.dtype)])
 
 
-def sort_points(path: str, grid: TileGrid, target: str) -> dict[str, Any]:
+def sort_points(path: str, grid: TileGrid, target: str) -> JsonObject:
     """Read a file once, write its points into a sorted copy, and return their index as a record.
 
     :class:`CloudIndex` parses it.
@@ -132,7 +132,7 @@ class Piece:
         return np.flatnonzero(self.away < 0)
 
     @property
-    def reader(self) -> dict[str, Any]:
+    def reader(self) -> StageJson:
         """Return the reader of its input, without a file name."""
         return {**self.source.reader, "type": "readers.las"}
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.grid import GridWindow
 from ..base.hashing import fingerprint
+from ..base.json_types import JsonObject
 from ..base.las_points import Layout, RecordColumns
 from ..base.messages import count_of, print_messages
 from ..base.version import build
@@ -35,7 +36,7 @@ from .tiled_run import SurveyRun, workers_of
 Part = tuple[str, Mapping[str, NDArray]]
 #: Reduces the points of a tile, those of each input that has any there, to arrays and figures that
 #: JSON can hold.
-Reduce = Callable[[list[Part]], tuple[dict[str, NDArray], dict[str, Any]]]
+Reduce = Callable[[list[Part]], tuple[dict[str, NDArray], JsonObject]]
 #: Column and row of a tile.
 Tile = tuple[int, int]
 #: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
@@ -56,7 +57,7 @@ def plan_of_records(name: str, files: Sequence[str]) -> TilePlan:
 class RecordRun(SurveyRun):
     """A run that reduces the tiles of a survey, and computes results from the records."""
 
-    def reduce(self, name: str, settings: Mapping[str, Any], reduce: Reduce) -> list[Job]:
+    def reduce(self, name: str, settings: JsonObject, reduce: Reduce) -> list[Job]:
         """Reduce the points of each tile; return its jobs, whose records are the figures.
 
         The arrays lie in :meth:`path_of` the job. `settings` are all that affects them beside the
@@ -170,7 +171,7 @@ def record_run(
         print_messages(f"{changed[0]} changed during the run: run it again")
 
 
-def earlier_layout(folder: Path, chosen: TilingOptions) -> dict[str, Any] | None:
+def earlier_layout(folder: Path, chosen: TilingOptions) -> JsonObject | None:
     """Return the tiles of the run that this one resumes, where the user gives no size."""
     known = Store(folder).note("run") if chosen.resume and chosen.tile is None else {}
     return known if "square" in known else None
@@ -190,7 +191,7 @@ def cells_in_tile(grid: TileGrid, tile: Tile, side: float) -> GridWindow:
 
 def _reduce_tile(
     grid: TileGrid, tile: Tile, sources: Sequence[InputSource], reduce: Reduce, target: str
-) -> dict[str, Any]:
+) -> JsonObject:
     """Read the points of a tile, save the arrays they are reduced to, and return the figures."""
     arrays, figures = reduce(points_of_tile(grid, tile, sources))
     save_arrays(target, arrays)

@@ -17,6 +17,7 @@ from ..base.errors import DependencyError, StageError
 from ..base.files import sweep
 from ..base.hashing import fingerprint
 from ..base.jit import count_cached_kernels
+from ..base.json_types import StageJson
 from ..base.messages import print_messages
 from ..base.progress import Progress
 from ..base.version import build
@@ -170,7 +171,7 @@ def _try_on_an_input(pipeline: Pipeline, survey: Survey, readers: int) -> None:
     """Let PDAL prepare the pipeline on one input: what is wrong fails before any tile."""
     source = pipeline.source
     inputs = survey.readable()
-    reader: dict[str, Any] = {**inputs[0].reader, "filename": inputs[0].path}
+    reader: StageJson = {**inputs[0].reader, "filename": inputs[0].path}
     tags = [stage.get("tag") for stage in source.stages[:readers]]
     stages = [{**reader, "tag": tag} if tag else dict(reader) for tag in tags]
     with contextlib.suppress(DependencyError):  # the program pdal is not there to ask

@@ -14,6 +14,7 @@ from ..base import las
 from ..base.distinct import DistinctPoints
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs
+from ..base.json_types import StageJson
 from ..base.las_points import columns_of_files
 from ..base.memory import free_memory
 from ..base.messages import Report
@@ -83,7 +84,7 @@ class TrainTask:
     named: Sequence[str] = ()  #: what the files were named by: patterns, tile indexes
 
     @cached_property
-    def _writer(self) -> dict[str, Any]:
+    def _writer(self) -> StageJson:
         """Return the training stage as in a pipeline."""
         writer = {"type": TrainModel.type, "filename": self.model, "files": list(self.files)}
         return overridden({**writer, **self.stage_options}, self.overrides)
@@ -133,7 +134,7 @@ class TrainTask:
         # A message that the preparation has as well comes once.
         return [text for text in messages if not any(text.endswith(f": {m}") for m in messages)]
 
-    def _read(self, files: Sequence[str], heights: Sequence[Mapping[str, Any]]) -> Points:
+    def _read(self, files: Sequence[str], heights: Sequence[StageJson]) -> Points:
         """Read the points with heights."""
         readers = [reader_of(file, f"input{i}") for i, file in enumerate(files, 1)]
         messages = check_readers(readers)
@@ -156,7 +157,7 @@ class TrainTask:
         points.report.warnings += pipeline.messages
         return points
 
-    def _train(self, heights: Sequence[Mapping[str, Any]], report: Report) -> Model:
+    def _train(self, heights: Sequence[StageJson], report: Report) -> Model:
         """Train on all points of a survey at once, one survey after the other."""
         training: Any = None
         distinct = DistinctPoints()

@@ -7,13 +7,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import whole_files
+from ..base.json_types import JsonObject, StageJson
 from ..base.las_check import check_complete
 from ..base.las_copy import LasCopy
 from ..base.las_points import Layout, read_records
@@ -142,7 +142,7 @@ def run_tail(
     plan: TilePlan,
     outputs: Sequence[str],
     scratch: str,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write copies of inputs, in one output or through the tail with its writers; return a record.
 
     The `outputs` get their names once all are complete, and only while the run with the temporary
@@ -162,7 +162,7 @@ def run_tail(
             sets[0].write(partial)
         return _record(outputs, sets, sets[0].copy.count)
     with TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True) as folder:
-        stages: list[dict[str, Any]] = []
+        stages: list[StageJson] = []
         listed: dict[str, str] = {}
         for number, (each, source) in enumerate(zip(sets, sources, strict=True)):
             path = Path(folder) / f"{number}.las"
@@ -180,7 +180,7 @@ def run_tail(
     return _record(outputs, sets, run.count)
 
 
-def _record(outputs: Sequence[str], sets: Sequence[PointsToWrite], count: int) -> dict[str, Any]:
+def _record(outputs: Sequence[str], sets: Sequence[PointsToWrite], count: int) -> JsonObject:
     classes = sum((each.classes for each in sets), Counter[str]())
     return {"outputs": written(outputs), "written": count, "classes": dict(classes)}
 
@@ -206,7 +206,7 @@ def write_file(
     results: list[str],
     outputs: list[str],
     scratch: str,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write the outputs of a file from the results of its tiles; return the record.
 
     It has class counts.
@@ -231,7 +231,7 @@ def write_file(
 
 def write_tile(
     results: list[PieceResults], plan: TilePlan, outputs: list[str], scratch: str
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write the points of a tile, from the files that were cut for it; return the record."""
     results = [result for result in results if result.piece.own_rows.size]
     if not results:
