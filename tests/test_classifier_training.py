@@ -7,7 +7,7 @@ import pytest
 
 from pdal_stages import Model, TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base.errors import DimensionError, ModelError, OptionError
-from pdal_stages.classifier import model_file
+from pdal_stages.classifier import model_file, training_percentiles
 from pdal_stages.classifier.prediction import Prediction
 
 SMALL = {
@@ -156,6 +156,31 @@ def test_counts_scores_and_importances(trained):
     text = str(trained)
     words = ("Ground", "Building", "kopt(5,20)", "HeightAboveGround", "a.laz", "held out")
     assert all(word in text for word in words)
+
+
+def test_the_file_holds_percentiles_of_the_samples_unless_they_are_many(trained, monkeypatch):
+    """Half of a class's samples lie below its median; the values are those of samples; 100 kB at most."""
+    ranges = trained.manifest()["passes"][0]["percentiles"]
+    assert list(ranges) == list(trained.passes[0].plan.names)
+    assert all(list(by_class) == ["2", "5", "6"] for by_class in ranges.values())
+    heights = ranges["HeightAboveGround"]
+    assert heights["6"][3] == pytest.approx(4.05, abs=0.1) and heights["2"][-1] < 0.11
+    assert all(row == sorted(row) for by_class in ranges.values() for row in by_class.values())
+    monkeypatch.setattr(training_percentiles, "LIMIT_BYTES", 100)
+    few = learn([TrainingCloud(*scene(), "a.laz")], folds=0)
+    assert "percentiles" not in few.manifest()["passes"][0]
+
+
+def test_percentiles_by_class_are_those_of_numpy():
+    rng = np.random.default_rng(3)
+    values, label = rng.normal(size=(500, 2)).astype(np.float32), rng.integers(0, 2, 500)
+    table = training_percentiles.percentiles_by_class(values, label, ["a", "b"], [2, 5, 6])
+    assert set(table["a"]) == {"2", "5"}  # class 6 has no samples
+    for column, name in enumerate("ab"):
+        for place, code in enumerate("25"):
+            of_class = values[label == place, column]
+            below = [np.mean(of_class <= 1.001 * value) for value in sorted(table[name][code])]
+            assert np.allclose(below, np.array(training_percentiles.PERCENTILES) / 100, atol=0.01)
 
 
 def test_several_clouds_are_sampled_together_but_are_not_neighbors():

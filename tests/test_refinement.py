@@ -91,6 +91,8 @@ def test_a_file_holds_the_base(base, tmp_path):
     again.save(tmp_path / "n.model")
     assert (tmp_path / "n.model").read_bytes() == (tmp_path / "m.model").read_bytes()
     assert "refined forest" in str(again)
+    held = [set(entry.get("percentiles", ())) for entry in again.manifest()["passes"]]
+    assert held[0] == held[2] and not held[1]  # of each training its first pass
 
 
 def leaves(value, at=()):

@@ -406,7 +406,7 @@ def assemble(manifest: JsonObject, arrays: model_file.Arrays) -> Model:
     if priors is not None and len(priors["factors"]) != len(codes):
         raise ModelError("priors need a factor for each class", found=len(priors["factors"]))
     info = {k: value for k, value in manifest.items() if k not in ("format", "version", "arrays")}
-    scores = ("importances", "codes", "factors")
+    scores = ("importances", "percentiles", "codes", "factors")
     info["passes"] = [
         {key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]
     ]

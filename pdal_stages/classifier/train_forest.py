@@ -30,6 +30,7 @@ from .model import Model
 from .sampling import BLOCK_M, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
+from .training_percentiles import percentiles_by_class
 
 #: Trees of a forest that judges a fold, as a share of the final one's: five folds then cost about
 #: as much as it (not tuned).
@@ -217,6 +218,10 @@ class ForestTraining:
         )
         if validation is not None and self.calibration.right:
             info["sureness"] = self.calibration.to_dict()
+        columns = self.features.plan.names
+        ranges = percentiles_by_class(self.values, self.samples.label, columns, self.codes)
+        if ranges is not None:
+            info["passes"][0]["percentiles"] = ranges
         names = dict(zip(self.codes, self.labeled.classes.names, strict=True))
         if base is None:
             return Model(tuple(forests), list(names.items()), info)

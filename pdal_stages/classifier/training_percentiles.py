@@ -1,0 +1,47 @@
+"""Percentiles of a model's inputs by class: what a value of a point is compared with."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+#: Percentiles of each input over the training samples of each class.
+PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
+#: Bytes of JSON that the percentiles of a pass may take; larger ones are left out.
+LIMIT_BYTES = 100_000
+
+#: By input and class code, as text: the values at :data:`PERCENTILES`.
+PercentileTable = dict[str, dict[str, list[float]]]
+
+
+def percentiles_by_class(
+    values: npt.NDArray[np.float32],
+    label: npt.NDArray[np.integer],
+    names: Sequence[str],
+    codes: Sequence[int],
+) -> PercentileTable | None:
+    """Return the percentiles of training samples, or None where these take too many bytes.
+
+    Parameters
+    ----------
+    values : (n, inputs) float32
+        Inputs of the samples.
+    label : (n,) int
+        Positions of their classes in `codes`.
+    names : sequence of str
+        Names of the inputs.
+    codes : sequence of int
+        Class codes.
+    """
+    table: PercentileTable = {name: {} for name in names}
+    for position, code in enumerate(codes):
+        rows = np.flatnonzero(label == position)
+        if not len(rows):
+            continue
+        for column, name in enumerate(names):
+            found = np.percentile(values[rows, column], PERCENTILES, method="nearest")
+            table[name][str(code)] = [float(f"{value:.4g}") for value in found]
+    return table if len(json.dumps(table)) < LIMIT_BYTES else None
