@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import sqlite3
 import subprocess
 import sys
@@ -93,6 +94,31 @@ def test_a_geopackage_that_is_open_elsewhere_is_refused(town, tmp_path, capsys):
         program.communicate()
     with closing(sqlite3.connect(out)) as base:
         assert base.execute("SELECT count(*) FROM left_behind").fetchone() == (2000,)
+
+
+def test_an_idle_reader_keeps_the_old_file_and_cannot_write_into_the_new_one(town, tmp_path):
+    """A reader without a log holds no lock: the file that it has open stays, without a name."""
+    out = tmp_path / "out.gpkg"
+    assert cli.main(["objects", str(town), str(out)]) == 0
+    with closing(sqlite3.connect(out)) as reader:
+        reader.execute("CREATE TABLE left_behind(text)")
+        reader.commit()
+        assert cli.main(["objects", str(town), str(out)]) == 0
+        assert reader.execute("SELECT count(*) FROM left_behind").fetchone() == (0,)
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            reader.execute("INSERT INTO left_behind VALUES ('x')")
+    assert "left_behind" not in layers(out)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.gpkg"]
+
+
+@pytest.mark.parametrize("name", ["o.tif", "o.shp", "o.laz"])
+def test_whoever_reads_a_file_keeps_what_he_has_open(tmp_path, name):
+    path = tmp_path / name
+    write_whole(path, b"old values")
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        write_whole(path, b"new ones")
+        assert file.read() == mapped[:] == b"old values"
+    assert path.read_bytes() == b"new ones"
 
 
 def test_indexes_of_a_shapefile_are_gone(town, tmp_path):

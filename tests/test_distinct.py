@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 
 import pdal_stages as ps
-from pdal_stages.base.distinct import DistinctPoints, overlaps_of, take_first
+from pdal_stages.base.distinct import DistinctPoints, count_shared, overlaps_of, take_first
 from pdal_stages.synthetic import write_town
 
 pytest.importorskip("pyogrio")
@@ -43,6 +44,18 @@ def test_earlier_clouds_have_the_points():
     boxes = [(0, 0, 10, 10), (10, 0, 20, 10), (30, 0, 40, 10)]
     assert overlaps_of(boxes)[:2] == [[(10, 0, 10, 10)]] * 2 and overlaps_of(boxes)[2] == []
     assert overlaps_of([*boxes, None])[2] == [(30, 0, 40, 10)]
+
+
+def test_points_that_clouds_share_are_counted_by_pair():
+    x = np.arange(9.0)
+    clouds = [{"X": x[part], "Y": x[part], "Z": x[part]} for part in np.split(np.arange(9), [4])]
+    assert count_shared(clouds) == {}
+    clouds += [dict.fromkeys("XYZ", x[2:6] + 1e-09)]  # another offset rounds otherwise
+    assert count_shared(clouds) == {(0, 2): 2, (1, 2): 2}
+    assert (
+        count_shared([{**cloud, "GpsTime": cloud["X"] * 0 + n} for n, cloud in enumerate(clouds)])
+        == {}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -153,3 +166,19 @@ def test_classify_writes_every_point_and_names_the_pair(folders, tmp_path, run):
     )
     counts = {path.name: len(laspy.read(path)) for path in (tmp_path / "out").glob("*.laz")}
     assert counts == {"a.laz": points, "a_copc.laz": points}
+
+
+@pytest.mark.pdal
+@pytest.mark.parametrize("tile", ["auto", "25"])
+def test_classify_names_files_that_overlap_by_a_third(folders, tmp_path, run, tile):
+    base, _, both = folders
+    words = ["classify", base / "thirds", tmp_path / "out", "--tile", tile, "--workers", 0]
+    code, _, said = run(*words, "--no-progress")
+    assert code == 0, said
+    names = [str(base / "thirds" / name) for name in ("e.laz", "w.laz")]
+    assert f"{names[0]} and {names[1]} both hold {both:,} points at the same place and time" in said
+    for name in names:
+        written = len(laspy.read(tmp_path / "out" / Path(name).name))
+        assert written == len(laspy.read(name))
+    code, _, said = run("classify", base / "neighbors", tmp_path / "two", "--workers", 0)
+    assert code == 0 and "same place" not in said

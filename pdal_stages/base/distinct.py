@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +44,7 @@ class DistinctPoints:
 
         `columns` have `X`, `Y`, `Z` in the unit of the file and, where it is known, `GpsTime`.
         """
-        x, y, z = (np.asarray(columns[axis], np.float64) for axis in "XYZ")
-        steps = [np.rint(values * _STEPS_PER_UNIT) for values in (x, y, z)]
-        times = [columns["GpsTime"]] if "GpsTime" in columns else [np.zeros(len(x))]
-        keys = hash_rows([*steps, *times], seed=0)
+        keys = _keys(columns)
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
         new = begins_run(ordered) & ~_among(self._seen, ordered)
@@ -56,6 +54,7 @@ class DistinctPoints:
         # Both parts are sorted already, which a stable sort makes use of.
         self._seen = np.sort(np.concatenate([self._seen, ordered[new]]), kind="stable")
         if self._overlaps:
+            x, y = columns["X"], columns["Y"]
             near = [
                 (x >= west) & (x <= east) & (y >= south) & (y <= north)
                 for west, south, east, north in self._overlaps
@@ -67,6 +66,28 @@ class DistinctPoints:
     def shared(self) -> NDArray[np.uint64]:
         """Return the sorted keys (n,) of the points in `overlaps`."""
         return np.sort(np.concatenate([np.empty(0, np.uint64), *self._shared]))
+
+
+def _keys(columns: Mapping[str, NDArray]) -> NDArray[np.uint64]:
+    """Return a key (n,) of each point, which follows from its place and time."""
+    steps = [np.rint(np.asarray(columns[axis], np.float64) * _STEPS_PER_UNIT) for axis in "XYZ"]
+    times = columns["GpsTime"] if "GpsTime" in columns else np.zeros(len(steps[0]))
+    return hash_rows([*steps, times], seed=0)
+
+
+def count_shared(clouds: Sequence[Mapping[str, NDArray]]) -> dict[tuple[int, int], int]:
+    """Return how many points of a cloud an earlier one has, too, by the numbers of both.
+
+    Clouds are columns as of :meth:`DistinctPoints.first`, none of them empty.
+    """
+    boxes = [
+        (*(np.min(cloud[axis]) for axis in "XY"), *(np.max(cloud[axis]) for axis in "XY"))
+        for cloud in clouds
+    ]
+    near = [number for number, meets in enumerate(overlaps_of(boxes)) if meets]
+    keys = {number: np.unique(_keys(clouds[number])) for number in near}
+    counts = {(a, b): int(_among(keys[a], keys[b]).sum()) for a, b in combinations(near, 2)}
+    return {pair: count for pair, count in counts.items() if count}
 
 
 def _among(known: NDArray[np.uint64], keys: NDArray[np.uint64]) -> NDArray[np.bool_]:

@@ -187,7 +187,21 @@ def messages_of(
             f"than could be read within {most_points:,} points; they may differ from an untiled "
             "run: " + ", ".join(short[:5])
         )
-    return messages
+    return messages + _shared_points(done)
+
+
+def _shared_points(tiles: Sequence[Job]) -> list[str]:
+    """Return a message about the pair of inputs that share most points, if any do."""
+    pairs: Counter[tuple[str, str]] = Counter()
+    for job in tiles:
+        for one, other, count in job.record.get("shared", []):
+            pairs[one, other] += count
+    more = f" (so do {len(pairs) - 1:,} more pairs of files)" if len(pairs) > 1 else ""
+    return [
+        f"{one} and {other} both hold {count_of(count, 'point')} at the same place and time{more}: "
+        "all are written, but points look twice as dense there; leave one of the two out"
+        for (one, other), count in pairs.most_common(1)
+    ]
 
 
 # ---- the working folder -------------------------------------------------------------------------

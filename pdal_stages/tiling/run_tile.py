@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
+from ..base.distinct import count_shared
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.json_types import JsonObject, StageJson
 from ..base.las_copy import LasCopy
@@ -354,6 +355,7 @@ class TileRecord:
     classes: dict[str, int]  #: points by class code
     messages: Sequence[str]
     point_counts: Mapping[str, int]  #: by ``type.name``
+    shared: list[tuple[str, str, int]]  #: pairs of inputs, and their points at one place and time
 
 
 # ---- the task of a worker ------------------------------------------------------------------------
@@ -453,7 +455,16 @@ def _describe(halo: _TileHalo, pieces: list[Piece], result: RoundResult) -> Tile
         class_counts(np.concatenate(classes)),
         result.messages,
         result.point_counts,
+        _shared(pieces) if halo.number + 1 == len(halo.context.plan.rounds) else [],
     )
+
+
+def _shared(pieces: Sequence[Piece]) -> list[tuple[str, str, int]]:
+    """Return the pairs of inputs that hold the same points in a tile, and how many."""
+    own = [(piece, piece.records[piece.own_rows]) for piece in pieces if len(piece.own_rows)]
+    columns = [RecordColumns([(piece.layout, records)]) for piece, records in own]
+    paths = [piece.source.path for piece, _ in own]
+    return [(paths[a], paths[b], count) for (a, b), count in count_shared(columns).items()]
 
 
 def _save(halo: _TileHalo, result: RoundResult, target: str) -> JsonObject:
