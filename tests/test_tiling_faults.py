@@ -32,7 +32,7 @@ from pdal_stages.cli import main
 from pdal_stages.pipeline import workers
 from pdal_stages.pipeline.workers import perform_task
 from pdal_stages.tiling import dask_workers as dask_cluster
-from pdal_stages.tiling import tiled_run
+from pdal_stages.tiling import plan_run
 from pdal_stages.tiling.jobs import Store
 
 pytestmark = pytest.mark.pdal
@@ -465,7 +465,7 @@ def test_a_name_that_is_not_utf8(tmp_path, folder, capsys):
 def test_damaged_results_are_made_anew(tmp_path, folder, expected, monkeypatch):
     stages = pipeline(folder, tmp_path / "o_#.laz")
     with monkeypatch.context() as patch:
-        patch.setattr(tiled_run, "write_file", lambda *_: 1 / 0)
+        patch.setattr(plan_run, "write_file", lambda *_: 1 / 0)
         assert run_tiled(stages, 20, workers=0).failures
     result = min((tmp_path / ".pdal-stages" / "kept").glob("*.npz"))
     then, data = result.stat().st_mtime_ns, bytearray(result.read_bytes())

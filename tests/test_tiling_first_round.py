@@ -19,7 +19,7 @@ from pdal_stages.terrain.ground_blocks import (
     reduced_points,
 )
 from pdal_stages.terrain.smrf import reach_of_cells
-from pdal_stages.tiling import tiled_run as run
+from pdal_stages.tiling import plan_run as run
 
 HEIGHTS = {"type": "filters.hag_morphological", "window": 8, "ground": True, "openings": [5, 9]}
 MADE = ("HeightAboveGround", "Ground", "HeightAboveOpening_5", "HeightAboveOpening_9")

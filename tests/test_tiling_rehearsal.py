@@ -9,7 +9,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages import run_tiled
-from pdal_stages.tiling import tiled_run as run
+from pdal_stages.tiling import plan_run as run
 
 pytestmark = pytest.mark.pdal
 

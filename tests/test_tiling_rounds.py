@@ -50,7 +50,7 @@ class LowestFar(FarReaching):
         return {"HeightAboveLowest": "double", "ByBlocks": "uint8_t"}
 
     def blocks(self):
-        return Blocks(side=SIDE, reach=0.0, margin=0.0, spill=0.0)
+        return Blocks(side=SIDE, reach=0.0, margin=0.0, overhang=0.0)
 
     def reduce_points(self, points):
         low = lowest(*points.axes)

@@ -365,7 +365,7 @@ class Blocks(NamedTuple):
     side: float
     reach: float  #: how far around a block points matter
     margin: float  #: how far beyond the points that are read a tile needs blocks
-    spill: float  #: how far beyond all points blocks hold something
+    overhang: float  #: how far beyond all points blocks hold something
     cell: float = 1.0  #: side of the cells that they are rasters of
 
 

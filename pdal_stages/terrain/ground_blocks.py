@@ -175,11 +175,11 @@ def cells_of_block(
     wanted = core.padded(1)  # points blend the four cells around them
     low = _in_cells(_thinned_far_away(outer, wanted, steps, options.cell), options)
     # Openings reach into cells without points.
-    spill = max([*options.requested_radii, 0]) + FILL_RINGS + 2
-    near = wanted.padded(max(spill, steps.reach(classify.last, PROVISIONAL)))
+    overhang = max([*options.requested_radii, 0]) + FILL_RINGS + 2
+    near = wanted.padded(max(overhang, steps.reach(classify.last, PROVISIONAL)))
     if not near.contains(low.column, low.row).any():
         return {}
-    window = GridWindow.enclosing(low.column, low.row).padded(spill)
+    window = GridWindow.enclosing(low.column, low.row).padded(overhang)
     kept: list[NDArray[np.float32]] = []
     raster = steps.run(low, holes(window), wanted, _cut_into(kept, wanted) if keep else None)
     means = ground_means(_judged(points, raster, options), options.cell, raster.window)

@@ -158,7 +158,7 @@ class ClassifyTask:
         plan = replace(
             plan,
             creates=["Classification", *extra_dims]
-            if len(plan.tail) == 1 and plan.creates
+            if len(plan.per_output) == 1 and plan.creates
             else plan.creates,
             makes=extra_dims,
             extra_dims=extra_dims,

@@ -32,13 +32,13 @@ _ready: dict[str, list[ExpandedStage | None]] = {}
 
 
 def ready_stages(context: RunContext) -> list[ExpandedStage | None]:
-    """Return our stages of the head, made once in a process; None in the places of PDAL's."""
+    """Return our stages in tiles, made once in a process; None in the places of PDAL's."""
     if context.scratch not in _ready:
         _ready.clear()
-        head = [with_threads(step, context.threads) for step in context.plan.head]
-        expanded = Pipeline(head).expanded.ours if head else []
+        stages = [with_threads(step, context.threads) for step in context.plan.in_tiles]
+        expanded = Pipeline(stages).expanded.ours if stages else []
         ours = {stage.number: stage for stage in expanded}
-        _ready[context.scratch] = [ours.get(number) for number in range(len(head))]
+        _ready[context.scratch] = [ours.get(number) for number in range(len(stages))]
     return _ready[context.scratch]
 
 
@@ -97,7 +97,7 @@ def blocks_near(context: RunContext, box: Box, distance_m: float) -> list[tuple[
 def load_blocks(context: RunContext, box: Box, read_m: float) -> list[SavedArrays]:
     """Return the blocks for a tile (its box) that is read with some meters around it."""
     assert context.plan.blocks is not None
-    distance_m = read_m + context.plan.blocks.margin + context.plan.blocks.spill
+    distance_m = read_m + context.plan.blocks.margin + context.plan.blocks.overhang
     names = map(block_name, blocks_near(context, box, distance_m))
     return [SavedArrays(path) for path in _existing(context.kept, names)]
 

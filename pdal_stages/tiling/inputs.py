@@ -219,7 +219,7 @@ class Survey:
 
         Inputs that stages see together must have the same.
         """
-        needed = bool(plan.head and plan.sees_m)
+        needed = bool(plan.in_tiles and plan.sees_m)
         known: dict[str, Reference] = {}  # PDAL is asked once for equal references
         references: dict[str, Reference] = {}
         for source in self.readable():
@@ -317,7 +317,7 @@ class Survey:
         """Return what the report tells about the pipeline, its models, the inputs and the tiles."""
         return {
             "pipeline": plan.name,
-            "models": [str(stage["model"]) for stage in plan.head if "model" in stage],
+            "models": [str(stage["model"]) for stage in plan.in_tiles if "model" in stage],
             "started": self.started,
             "tile": self.grid.size,
             "halo_m": plan.halo_m,

@@ -91,7 +91,7 @@ class _RoundRun:
     #: Dimensions of the tile's own points alone, to save memory; one for each view.
     views: list[dict[str, NDArray]] = field(default_factory=list)
     reduced: list[dict[str, NDArray]] = field(default_factory=list)  #: one for each view
-    #: Place in the pipeline of our stages -> step of the head.
+    #: Place in the pipeline of our stages -> its number in :attr:`TilePlan.in_tiles`.
     steps: dict[int, int] = field(default_factory=dict)
     expanded: dict[int, ExpandedStage] = field(default_factory=dict)  #: by place in the pipeline
 
@@ -144,8 +144,8 @@ class _RoundRun:
         ours = [stage for stage in ready[part.begin : part.end] if stage is not None]
         pipeline = Pipeline(stages, ready=ours)
         self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
-        if part.end == len(plan.head) and not plan.copied:  # codes of earlier rounds may change
-            check_outputs([*pipeline.expanded.stages, *plan.tail], pipeline.expanded.ours)
+        if part.end == len(plan.in_tiles) and not plan.copied:  # codes of earlier rounds may change
+            check_outputs([*pipeline.expanded.stages, *plan.per_output], pipeline.expanded.ours)
         for number, stage in self.expanded.items():
             used_m = part.used_m[self.steps[number] - part.begin]
             stage.update_context(outside=OUTSIDE, used_m=used_m)
@@ -169,7 +169,7 @@ class _RoundRun:
         stages: list[StageJson] = [{**self.pieces[0].reader, "filename": "piece.las"}]
         for number in range(part.begin, part.end):
             self.steps[len(stages)] = number
-            stages.append(with_threads(self.context.plan.head[number], self.context.threads))
+            stages.append(with_threads(self.context.plan.in_tiles[number], self.context.threads))
         return stages
 
     def _stages(self, origins: Sequence[Mapping[str, NDArray]]) -> list[StageJson]:
@@ -193,7 +193,7 @@ class _RoundRun:
         # PDAL's own filters see one file at a time, until a stage merges them.
         apart = len(self.pieces) > 1
         head_begins = len(stages)
-        for number, step in enumerate(plan.head[part.begin : part.end], part.begin):
+        for number, step in enumerate(plan.in_tiles[part.begin : part.end], part.begin):
             if apart and _merges(step):
                 stages.append({"type": "filters.merge"})
                 apart = False
@@ -422,7 +422,7 @@ def _join_and_run(halo: _TileHalo, pieces: list[Piece], folder: str) -> RoundRes
     """Join pieces with results of earlier rounds, run the stages; None where no ground is near."""
     plan, part = halo.context.plan, halo.context.plan.rounds[halo.number]
     has_points = any(len(piece.own_rows) for piece in pieces)
-    if not has_points or (not plan.head and part.blocks is None):
+    if not has_points or (not plan.in_tiles and part.blocks is None):
         return RoundResult([PieceResults(piece, piece.own_rows, {}) for piece in pieces])
     complete = halo.complete
     try:

@@ -28,9 +28,10 @@ from ..base.version import build
 from .inputs import InputSource, Survey
 from .jobs import Job, Store, load_arrays, save_arrays
 from .options import TileGrid, TilingOptions
-from .plan import Round, TilePlan
+from .plan import TilePlan
+from .rounds import Round
 from .sorted_points import points_near
-from .tiled_run import SurveyRun, workers_of
+from .survey_run import SurveyRun, workers_of
 
 #: Points of an input: its path, and their dimensions by PDAL's names.
 Part = tuple[str, Mapping[str, NDArray]]

@@ -1,4 +1,4 @@
-"""Write outputs: copies of inputs with the results of tiles, or what the tail makes of these."""
+"""Write outputs: copies of inputs with the results of tiles, or what stages make of these."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def result_types(tiles: Iterable[str], source: InputSource) -> dict[str, np.dtyp
     return {}
 
 
-# ---- copies with new values, and the tail --------------------------------------------------------
+# ---- copies with new values, and stages per output -----------------------------------------------
 
 
 @dataclass
@@ -143,7 +143,7 @@ def run_tail(
     outputs: Sequence[str],
     scratch: str,
 ) -> JsonObject:
-    """Write copies of inputs, in one output or through the tail with its writers; return a record.
+    """Write copies of inputs, in one output or through the stages per output; return a record.
 
     The `outputs` get their names once all are complete, and only while the run with the temporary
     folder `scratch` exists.
@@ -172,7 +172,7 @@ def run_tail(
             listed |= named_types(Layout.of(path))
         stages.append({"type": "filters.merge", "inputs": [stage["tag"] for stage in stages]})
         dimensions = ",".join(f"{name}={kind}" for name, kind in listed.items())
-        for stage in plan.tail:
+        for stage in plan.per_output:
             plain = {name: value for name, value in stage.items() if name != "inputs"}
             named = plan.extra_dims is not None and stage["type"] in LAS_WRITERS and dimensions
             stages.append({"extra_dims": dimensions, **plain} if named else plain)

@@ -1,0 +1,221 @@
+"""The jobs of a plan: its tiles and outputs, what each depends on, and what of them is there."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any
+
+from ..base.hashing import fingerprint
+from ..base.version import build
+from ..pipeline.spatial_reference import NO_REFERENCE
+from ..pipeline.workers import Workers
+from ..stages.points import METERS_ASSUMED
+from .inputs import Survey
+from .jobs import Job, Store, TiledRun, messages_of, summarize
+from .plan import RunContext, TilePlan, outputs_for
+from .run_tile import run_tile
+from .survey_run import SurveyRun
+from .write_outputs import write_file
+
+
+class PlanRun(SurveyRun):
+    """The state of a run of a plan: jobs that are to be done, and that are done."""
+
+    def __init__(
+        self, plan: TilePlan, survey: Survey, store: Store, workers: Workers, show: bool | None
+    ) -> None:
+        super().__init__(survey, store, workers, show)
+        self.plan = plan
+        self.tiles: list[Job] = []  #: with points of their own, row by row
+        self.squares: list[Job] = []  #: of the rounds before the last
+        self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
+        self.messages_before: list[list[str]] = []  #: of the rounds before the last
+        #: How far around a tile, in units of the coordinates, inputs are available: its halo may
+        #: have to grow (four halos are room for that, not tuned).
+        halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
+        self.farthest = max(4 * survey.halo_units, halo_units + survey.grid.size)
+
+    def result(self, seconds: float) -> TiledRun:
+        """Return what was done in a time."""
+        survey = self.survey
+        summary = survey.figures(self.plan) | {
+            "workers": self.workers.slots,
+            "threads_per_worker": self.workers.threads,
+            **summarize(self.tiles, self.squares, self.cpu_seconds, seconds),
+            "peak_mb_of_a_worker": self.peak_mb,
+        }
+        most = survey.options.most_points
+        messages = messages_of(self.tiles, self.squares, self.messages_before, most)
+        if any(NO_REFERENCE in text for text in survey.messages):  # it tells what is assumed
+            messages = [text for text in messages if METERS_ASSUMED not in text]
+        messages = survey.messages + messages
+        changed = survey.changed()
+        return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
+
+    # ---- tiles and outputs -----------------------------------------------------------------------
+
+    def inputs_of_waiting(self) -> set[str]:
+        """Return the inputs whose points waiting tiles and their rounds read."""
+        far = len(self.plan.rounds) * (self.farthest + self.survey.squares.size)
+        if blocks := self.plan.blocks:
+            far += (self.plan.sees_m + blocks.side + blocks.reach) / self.survey.unit
+        waiting = [job.tile for job in self.tiles if job.state == "waiting"]
+        return {source.path for tile in waiting for source in self.survey.near(tile, far)}
+
+    def find_jobs(self) -> None:
+        """Find all tiles and outputs; those with unreadable inputs fail.
+
+        A job's digest is a fingerprint of everything that affects its result, including every input
+        that may be read for it.
+        """
+        plan, survey, grid = self.plan, self.survey, self.survey.grid
+        sees = plan.sees_m / survey.unit
+        count, per_tile = len(plan.in_tiles), survey.options.per == "tile"
+        writing = [plan.per_output, plan.extra_dims, survey.stamps_of(plan.files[count:])]
+        common = fingerprint(
+            build(),
+            [plan.in_tiles, survey.stamps_of(plan.files[:count]), plan.creates, plan.halo_m, sees],
+            [vars(grid), survey.options.most_points],
+            writing if per_tile else [],
+        )
+        for tile, points in survey.tiles().items():
+            job = Job(grid.name(tile), points, tile)
+            near = survey.near(tile, max(sees, self.farthest))
+            job.digest = fingerprint(common, tile, [source.content for source in near])
+            if bad := [source.path for source in survey.near(tile, sees) if source.fault]:
+                job.fail(f"an input here cannot be read: {bad[0]}", blocked=True)
+            self.tiles.append(job)
+        self.plan = plan.adapt(len(self.tiles), survey.tiles_per_square)
+        if per_tile:
+            named = outputs_for(plan, survey.paths, [job.name for job in self.tiles])
+            for job, paths in zip(self.tiles, named, strict=True):
+                job.outputs = paths
+            return
+        by_tile = {job.tile: job for job in self.tiles}
+        for source, paths in zip(survey.sources, survey.outputs, strict=True):
+            out = Job(f"file-{source.key}", source=source, outputs=paths)
+            if index := source.index:
+                out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
+            out.digest = fingerprint(
+                source.content, writing, [job.digest for job in out.jobs], paths
+            )
+            if source.fault:
+                out.fail(f"its input cannot be read: {source.path}", blocked=True)
+            self.outputs.append(out)
+
+    def take_over(self) -> None:
+        """Keep the results of an earlier run; tiles that no output needs are not run again."""
+        needed = {job.name for out in self.unkept(self.outputs) for job in out.jobs}
+        self.unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
+        outputs = {path for job in (*self.tiles, *self.outputs) for path in job.outputs or ()}
+        self.survey.messages += [
+            *_name_outputs(
+                "outputs edited since they were written are kept (--overwrite replaces them)",
+                self.edited,
+            ),
+            *_name_outputs(
+                "outputs of inputs that are not among those of this run",
+                self.store.left_over(outputs),
+            ),
+        ]
+        for job in self.tiles:
+            if job.state == "waiting" and job.outputs is None and job.name not in needed:
+                known = self.store.note(job.name)
+                job.state, job.record = (
+                    "kept",
+                    known if known.get("fingerprint") == job.digest else {},
+                )
+
+    @cached_property
+    def context(self) -> RunContext:
+        """Return the context of all tasks."""
+        survey, most = self.survey, self.survey.options.most_points
+        if survey.density.points <= most:
+            most = 1 << 62  # all points fit, however wide the halo
+        plan = replace(self.plan, readers=[])  # tasks travel, and there may be thousands
+        return RunContext(
+            plan,
+            grid=survey.grid,
+            squares=survey.squares,
+            unit=survey.unit,
+            bounds=survey.bounds,
+            threads=self.workers.threads,
+            most_points=most,
+            wkt=survey.reference.wkt,
+            scratch=str(self.store.scratch),
+            kept=str(self.store.kept),
+        )
+
+    def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
+        """Run all waiting tiles, and outputs as soon as their last tile is done.
+
+        `finished` is called with outputs.
+        """
+        context, store = self.context, self.store
+        waiting = deque(job for job in self.tiles if job.state == "waiting")
+        users: dict[str, list[Job]] = {}
+        for out in self.outputs:
+            _make_ready(out, waiting)
+            for job in out.jobs:
+                users.setdefault(job.name, []).append(out)
+
+        def task_of(job: Job) -> Callable[[], Any]:
+            if job.source is None:
+                return self.tile_task(len(self.plan.rounds) - 1, job)
+            results = [store.path(each.name) for each in job.jobs]
+            assert job.outputs is not None
+            plan, scratch = context.plan, context.scratch
+            return partial(write_file, plan, job.source, results, job.outputs, scratch)
+
+        for job in self.do("tiles", waiting, task_of):
+            written = job.state == "done" and job.outputs and job.record["outputs"]
+            if finished is not None and written:
+                finished(job)
+            for out in users.get(job.name, ()):
+                _make_ready(out, waiting)
+
+    def tile_task(self, number: int, job: Job) -> Callable[[], Any]:
+        """Return the task that runs a round on a tile or square."""
+        survey = self.survey
+        box = self.context.grid_of(number).box(job.tile, self.farthest)
+        sources = survey.near_box(box)
+        complete = math.inf if len(sources) == len(survey.placed) else self.farthest * survey.unit
+        target = self.store.path(job.name)
+        readable = [source for source in sources if not source.fault]
+        return partial(
+            run_tile, self.context, number, job.tile, readable, complete, target, job.outputs
+        )
+
+    def forget(self) -> None:
+        """Remove files that no job needs any more."""
+        needed = {
+            f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs
+        }
+        if any(job.state == "failed" for job in self.tiles):
+            for pattern in ("*.block.npz", "*.round*.npz"):
+                needed |= {path.name for path in self.store.kept.glob(pattern)}
+        self.store.remove(".npz", needed)
+
+
+def _name_outputs(what: str, paths: Sequence[str]) -> list[str]:
+    """Return a message about outputs, if there are any."""
+    more = f" and {len(paths) - 3:,} more" if len(paths) > 3 else ""
+    return [f"{what}: {', '.join(paths[:3])}{more}"] if paths else []
+
+
+def _make_ready(out: Job, waiting: deque[Job]) -> None:
+    """Queue an output when its last tile is done."""
+    if out.state != "waiting" or any(job.state == "waiting" for job in out.jobs):
+        return
+    failed = [job for job in out.jobs if job.state == "failed"]
+    if failed:
+        others = f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""
+        blocked = all(job.blocked for job in failed)
+        out.fail(f"tile {failed[0].name} failed{others}", blocked)
+    else:
+        out.state = "ready"
+        waiting.appendleft(out)

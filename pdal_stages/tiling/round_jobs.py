@@ -1,0 +1,121 @@
+"""The jobs of the rounds before the last: squares of tiles, and blocks of a far-reaching stage."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from functools import cached_property, partial
+from typing import Any
+
+from ..base.hashing import fingerprint
+from ..base.version import build
+from .earlier_rounds import block_name, blocks_near, make_block, square_name
+from .jobs import Job
+from .options import Box, TileGrid
+from .plan_run import PlanRun
+from .survey_run import stop_if_hopeless
+
+
+class RoundJobs:
+    """The rounds before the last of a run."""
+
+    def __init__(self, run: PlanRun) -> None:
+        self.run = run
+
+    def make(self) -> None:
+        """Run the rounds that waiting tiles need and an earlier run has not left.
+
+        Jobs that depend on failed ones fail, too.
+        """
+        waiting = [job for job in self.run.tiles if job.state == "waiting"]
+        users = waiting
+        layers: list[tuple[list[Job], list[Job]]] = []
+        for number in reversed(range(len(self.run.plan.rounds) - 1)):
+            layers.insert(0, self._layer(number, users))
+            users = layers[0][0]
+        for number, (squares, blocks) in enumerate(layers):
+            for job in squares:
+                job.fail_with(job.jobs)
+            label = f"round {number + 1}"
+            task_of = partial(self.run.tile_task, number)
+            for job in self.run.do(label, self.run.unkept(squares), task_of):
+                self.run.messages_before.append(job.record.get("messages", []))
+            for job in blocks:
+                job.fail_with(job.jobs)
+            for _ in self.run.do(f"{label}, blocks", self.run.unkept(blocks), self._block_task):
+                pass
+            self.run.squares += squares
+        for job in waiting:
+            job.fail_with(job.jobs)
+        stop_if_hopeless([job.reason for job in waiting])
+
+    @cached_property
+    def _points_of_squares(self) -> dict[tuple[int, int], int]:
+        """Return the squares that have points, and how many."""
+        points: Counter[tuple[int, int]] = Counter()
+        factor = self.run.survey.tiles_per_square
+        for job in self.run.tiles:
+            points[job.tile[0] // factor, job.tile[1] // factor] += job.points
+        return points
+
+    def _layer(self, number: int, users: list[Job]) -> tuple[list[Job], list[Job]]:
+        """Return jobs for the squares of a round, and for blocks, that `users` need (their jobs).
+
+        What an earlier run with other inputs left is removed.
+        """
+        context, survey, part = self.run.context, self.run.survey, self.run.plan.rounds[number]
+        grid, every, unit = context.grid_of(number + 1), self._points_of_squares, survey.unit
+        names = {square: f"{square_name(context, number, square)}.npz" for square in every}
+        self.run.store.remove(f".round{number}.npz", names.values())
+        squares: dict[tuple[int, int], Job] = {}
+        blocks: dict[tuple[int, int], Job] = {}
+
+        def squares_in(box: Box) -> list[Job]:
+            places = sorted(every.keys() & survey.squares.covering(box))
+            for place in places:
+                squares[place] = squares.get(place) or self._square_job(number, place)
+            return [squares[place] for place in places]
+
+        far = self.run.farthest if self.run.plan.rounds[number + 1].halo_m else 0.0
+        for job in users:
+            box = grid.box(job.tile, far)
+            job.jobs = squares_in(box) if part.kept else []
+        if part.blocks is None:
+            return list(squares.values()), []
+        boxes = [survey.grid.box(job.tile) for job in self.run.tiles]
+        places = {b for box in boxes for b in blocks_near(context, box, part.blocks.overhang)}
+        self.run.store.remove(".block.npz", [f"{block_name(place)}.npz" for place in places])
+        distance_m = self.run.farthest * unit + part.blocks.margin
+        for job in users:
+            near = blocks_near(context, grid.box(job.tile), distance_m)
+            for place in sorted(places.intersection(near)):
+                if place not in blocks:
+                    # One meter more, as the box may be rounded.
+                    box_m = TileGrid(part.blocks.side).box(place, part.blocks.reach + 1.0)
+                    x0, y0, x1, y1 = (side / unit for side in box_m)
+                    needed = squares_in((x0, y0, x1, y1))
+                    digest = fingerprint(place, part.blocks, [each.digest for each in needed])
+                    blocks[place] = Job(block_name(place), 1, place, jobs=needed, digest=digest)
+                job.jobs.append(blocks[place])
+        return list(squares.values()), list(blocks.values())
+
+    def _square_job(self, number: int, square: tuple[int, int]) -> Job:
+        """Return the job of a square; its digest tells of all inputs that may matter."""
+        survey, part = self.run.survey, self.run.plan.rounds[number]
+        stages = self.run.plan.in_tiles[: part.end + (part.blocks is not None)]
+        far = max(self.run.plan.sees_m / survey.unit if number else 0.0, self.run.farthest)
+        box = survey.squares.box(square, far)
+        digest = fingerprint(
+            [build(), stages, survey.stamps_of(self.run.plan.files[: len(stages)])],
+            [survey.layout, survey.unit, vars(part), square],
+            [source.content for source in survey.near_box(box) if not source.fault],
+        )
+        name = square_name(self.run.context, number, square)
+        return Job(name, self._points_of_squares[square], square, digest=digest)
+
+    def _block_task(self, job: Job) -> Callable[[], Any]:
+        """Return the task that computes a block."""
+        squares = [self.run.store.path(each.name) for each in job.jobs]
+        return partial(
+            make_block, self.run.context, job.tile, squares, self.run.store.path(job.name)
+        )

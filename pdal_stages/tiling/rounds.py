@@ -1,0 +1,87 @@
+"""Rounds of a tiled run: which stages run on the whole survey before others do, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from ..stages.base import Blocks
+from .planned_stage import PlannedStage
+
+#: Meters; stages that look farther see saved results of the stages before them, which would
+#: otherwise be computed again in a wide halo. The shipped model looks 48, bridges 367; in between
+#: the value was not tuned.
+_FAR_M = 64.0
+
+
+@dataclass(frozen=True)
+class Round:
+    """Stages that run on all tiles, or larger squares, before later stages do."""
+
+    begin: int  #: index of its first stage in :attr:`.plan.TilePlan.in_tiles`
+    end: int  #: index after its last stage
+    #: Of each stage, meters outside the tile within which later ones of the round use its results.
+    used_m: list[float]
+    #: Of each, how far around the points that it reads they must lie for the stages before it to
+    #: be right.
+    upstream_m: list[float]
+    halo_m: float  #: of each tile
+    #: Dimensions that the stages before `end` change, saved for the next round. Empty: there are
+    #: none, or the next round runs these stages again.
+    kept: list[str] = field(default_factory=list)
+    #: Of the far-reaching stage at `end`: squares that are computed of all points.
+    blocks: Blocks | None = None
+
+
+def make_round(
+    stages: list[PlannedStage],
+    reaches: list[float],
+    begin: int,
+    end: int,
+    kept: Sequence[str] = (),
+    blocks: Blocks | None = None,
+) -> Round:
+    """Return a round of the stages from `begin` to `end`, which look `reaches` (meters) far."""
+    part, reaches = stages[begin:end], reaches[begin:end]
+    used, upstream = [0.0] * len(part), [0.0] * len(part)
+    for n, stage in enumerate(part):
+        seen = [k for k in range(n) if stage.sees_results_of(part[k])]
+        upstream[n] = max((reaches[k] + upstream[k] for k in seen), default=0.0)
+    for n in range(len(part) - 1, -1, -1):
+        for m in range(n + 1, len(part)):
+            reach = reaches[m] if part[m].sees_results_of(part[n]) else 0.0
+            used[n] = max(used[n], used[m] + reach)
+    halo = max((u + reach for u, reach in zip(used, reaches, strict=True)), default=0.0)
+    return Round(begin, end, used, upstream, halo, list(kept), blocks)
+
+
+def cut_into_rounds(stages: list[PlannedStage], reaches: list[float]) -> list[Round]:
+    """Cut stages before those that look far, which then see saved results of the earlier ones.
+
+    Blocks serve the first far-reaching stage, which then needs no halo.
+    """
+    rounds: list[Round] = []
+    begin, open_ended = 0, False
+    for at, stage in enumerate(stages):
+        only = not open_ended and not any(each.blocks for each in rounds)
+        blocks = stage.ours.blocks() if stage.ours is not None and only else None
+        kept = _kept(stages[:at])
+        if blocks is not None or (kept is not None and at > begin and reaches[at] > _FAR_M):
+            rounds.append(make_round(stages, reaches, begin, at, kept=kept or [], blocks=blocks))
+            begin = begin if kept is None else at
+        if blocks is not None:
+            reaches = [*reaches[:at], 0.0, *reaches[at + 1 :]]
+        open_ended = open_ended or (stage.ours is not None and stage.ours.open_ended)
+    rounds.append(make_round(stages, reaches, begin, len(stages)))
+    kept = _kept(stages)
+    if kept and rounds[-1].halo_m > _FAR_M:  # on squares, of which tiles then take their points
+        rounds[-1] = replace(rounds[-1], kept=kept)
+        rounds.append(make_round(stages, reaches, len(stages), len(stages)))
+    return rounds
+
+
+def _kept(before: list[PlannedStage]) -> list[str] | None:
+    """Return the dimensions that stages change, if saving these is enough; else None."""
+    if any(stage.ours is None and stage.type != "filters.merge" for stage in before):
+        return None  # which may drop points
+    return sorted({name for stage in before if stage.ours for name in stage.ours.creates()})
