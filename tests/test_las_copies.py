@@ -143,7 +143,7 @@ def test_others_read_what_was_appended(inputs, tmp_path):
         las = laspy.read(out)
         if name != "behind":  # laspy does not look there
             assert 0 < np.asarray(las["Reliability"]).max() <= 1
-        assert Layout.of(out).own["Reliability"].type == np.float32
+        assert Layout.of_file(out).extra_by_name["Reliability"].type == np.float32
 
 
 # ---- dimensions of ours that the input holds -----------------------------------------------------
@@ -258,4 +258,4 @@ def test_damaged_files_are_refused(tmp_path):
     with pytest.raises(StageError, match="extra bytes"):
         data = LasFile(extra=2, described=(entry(b"long", 10),)).build()
         (tmp_path / "b.las").write_bytes(data)
-        Layout.of(tmp_path / "b.las")
+        Layout.of_file(tmp_path / "b.las")

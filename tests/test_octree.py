@@ -11,7 +11,7 @@ import pytest
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.las_check import check_copc, check_ept
+from pdal_stages.base.octrees import check_copc, check_ept
 
 #: Where COPC's record and the points begin; bytes of a chunk; where they end.
 INFO = 429

@@ -19,7 +19,7 @@ _STEPS_PER_UNIT = 1e6
 
 
 class DistinctPoints:
-    """Which points are the first at their place and time, of one cloud that comes in parts.
+    """Finds points that are the first at their place and time, of a cloud that comes in parts.
 
     Points without a time (``GpsTime``) have the time 0. Memory: 8 bytes a point.
 

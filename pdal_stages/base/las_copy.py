@@ -84,7 +84,9 @@ class LasCopy:
         projection: Sequence[tuple[int, bytes]] | None = None,
     ) -> None:
         self.layout, self.source = layout, source
-        self.replaced = {name: layout.own[name] for name in added if name in layout.own}
+        self.replaced = {
+            name: layout.extra_by_name[name] for name in added if name in layout.extra_by_name
+        }
         refuse_narrow(source, layout, added)
         self.added = {n: np.dtype(kind) for n, kind in added.items() if n not in self.replaced}
         self.at: dict[str, int] = {}  #: byte of a record at which each begins
@@ -307,7 +309,7 @@ class LasCopy:
 def refuse_narrow(source: str, layout: Layout, added: Mapping[str, np.dtype]) -> None:
     """Refuse dimensions of the input whose type cannot hold the values that they would get."""
     for name, kind in added.items():
-        field = layout.own.get(name)
+        field = layout.extra_by_name.get(name)
         if field is None:
             continue
         fits = field.type.kind == np.dtype(kind).kind == "f" or np.can_cast(kind, field.type)

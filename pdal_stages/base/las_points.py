@@ -165,13 +165,13 @@ def description(path: str | os.PathLike) -> bytes:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the dimensions of a file's points stand in their records."""
+    """The layout of a file's records: where each dimension of its points stands."""
 
     header: LasHeader
     extra: tuple[ExtraField, ...] = ()
 
     @classmethod
-    def of(cls, path: str | os.PathLike) -> Layout:
+    def of_file(cls, path: str | os.PathLike) -> Layout:
         """Return the layout of a file; StageError where it has none."""
         header = read_header(path)
         if header is None:
@@ -198,7 +198,7 @@ class Layout:
         return _OLD_BITS if self.is_old else _NEW_BITS
 
     @cached_property
-    def own(self) -> dict[str, ExtraField]:
+    def extra_by_name(self) -> dict[str, ExtraField]:
         """Return extra dimensions by name, but those that are named like one of the format."""
         taken = {*self._bits, *(self.dtype.names or ())}
         return {each.name: each for each in self.extra if each.name and each.name not in taken}
@@ -207,14 +207,14 @@ class Layout:
     def names(self) -> list[str]:
         """Return all dimensions."""
         fields = [name for name in self.dtype.names or () if name[0].isupper()]
-        return [*fields, *self._bits, *self.own]
+        return [*fields, *self._bits, *self.extra_by_name]
 
     def type_of(self, name: str) -> np.dtype:
         """Return the type of a dimension's values."""
         if name in "XYZ":
             return np.dtype(float)
-        if name in self.own:
-            each = self.own[name]
+        if name in self.extra_by_name:
+            each = self.extra_by_name[name]
             return np.dtype(float) if each.is_scaled else each.type.newbyteorder("=")
         if name == "ScanAngleRank":
             return np.dtype(np.float32)
@@ -225,8 +225,8 @@ class Layout:
         if name in self._bits:
             field, low, count = self._bits[name]
             return records[field] >> np.uint8(low) & np.uint8((1 << count) - 1)
-        if name in self.own:
-            each = self.own[name]
+        if name in self.extra_by_name:
+            each = self.extra_by_name[name]
             raw = extra_bytes(records)[:, each.at : each.at + each.type.itemsize]
             values = np.ascontiguousarray(raw).view(each.type)[:, 0]
             if each.is_scaled:
@@ -244,8 +244,8 @@ class Layout:
 
     def put(self, records: NDArray, name: str, values: NDArray) -> None:
         """Set a dimension (n,) of records (n,); a value that does not fit is cut off."""
-        if name in self.own:
-            each = self.own[name]
+        if name in self.extra_by_name:
+            each = self.extra_by_name[name]
             steps = np.rint((values - each.shift) / each.scale) if each.is_scaled else values
             raw = extra_bytes(records)[:, each.at : each.at + each.type.itemsize]
             raw[:] = np.ascontiguousarray(steps, each.type).view(np.uint8).reshape(raw.shape)
@@ -266,14 +266,14 @@ class Layout:
     def layers(self, names: Iterable[str]) -> set[str]:
         """Return what lazrs must decode for some dimensions."""
         fields = {self._bits[n][0] if n in self._bits else n for n in names}
-        fields = {"extra" if name in self.own else name for name in fields}
+        fields = {"extra" if name in self.extra_by_name else name for name in fields}
         return {_LAYERS[name] for name in fields if name in _LAYERS}
 
 
 def layout_there(path: str | os.PathLike) -> Layout | None:
     """Return the layout of a LAS file; None where it cannot be read, which reading reports."""
     try:
-        return Layout.of(path)
+        return Layout.of_file(path)
     except (OSError, ValueError, IndexError, StageError):
         return None
 
@@ -420,7 +420,7 @@ def columns_of_files(paths: Sequence[str]) -> RecordColumns:
     """Return the dimensions of all points of files, one after the other."""
     parts: list[tuple[Layout, NDArray]] = []
     for path in paths:
-        layout = Layout.of(path)
+        layout = Layout.of_file(path)
         records = [np.empty(0, layout.dtype), *read_records(path, layout)]
         parts.append((layout, np.concatenate(records)))
     return RecordColumns(parts)

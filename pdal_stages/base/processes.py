@@ -97,7 +97,7 @@ def serve() -> None:
     waiting: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(calls, waiting), daemon=True).start()
     while True:
-        results.write(_perform(waiting.get()))
+        results.write(_result_of(waiting.get()))
         results.flush()
 
 
@@ -109,7 +109,7 @@ def _receive(calls: BinaryIO, waiting: queue.SimpleQueue[bytes]) -> None:
     os._exit(1)
 
 
-def _perform(call: bytes) -> bytes:
+def _result_of(call: bytes) -> bytes:
     """Return whether a call failed, and its result or error, pickled."""
     try:
         function, arguments = pickle.loads(call)

@@ -30,7 +30,7 @@ _HOW = "Options of the reader: --readers.text.separator, --readers.text.header, 
 
 @dataclass
 class TextPoints:
-    """What a text file holds: the number of points, and of each axis its range and decimals."""
+    """The points of a text file: their number, and of each axis its range and decimals."""
 
     count: int = 0
     low: dict[str, float] = field(default_factory=dict)

@@ -187,7 +187,7 @@ class Blend:
 
 @runtime_checkable
 class FeatureReader(Protocol):
-    """What reads features of the points and context of the pass before."""
+    """A pass that reads features of the points, and context of the pass before."""
 
     @property
     def features(self) -> Features:
@@ -195,7 +195,7 @@ class FeatureReader(Protocol):
 
     @property
     def context(self) -> Context | None:
-        """What it reads of the pass before; None of the first pass."""
+        """The context features that it reads of the pass before; None of the first pass."""
 
     def probabilities(
         self, values: npt.NDArray[np.float32], rows: npt.NDArray[np.int64]

@@ -30,7 +30,7 @@ class FeatureKind:
 
     @property
     def trainer(self) -> Trainer:
-        """What trains it."""
+        """The trainer of this kind."""
         from .train_forest import FeatureTrainer
 
         return FeatureTrainer(self.name, self.load())

@@ -108,7 +108,7 @@ class Estimator(Protocol):
 
     @property
     def context(self) -> Context | None:
-        """What it reads of the pass before."""
+        """The context features that it reads of the pass before; None of the first pass."""
 
     def arrays(self) -> Mapping[str, npt.NDArray]:
         """Return the arrays that a model file stores."""
@@ -136,7 +136,7 @@ class BatchEstimator(PointEstimator, Protocol):
 
 
 class Trainer(Protocol):
-    """What trains one kind; `options` are :class:`.training_options.TrainingOptions`."""
+    """Trains one kind; `options` are :class:`.training_options.TrainingOptions`."""
 
     @property
     def optional_inputs(self) -> Mapping[str, Sequence[str]]:
@@ -161,7 +161,7 @@ class EstimatorKind(Protocol):
 
     @property
     def trainer(self) -> Trainer:
-        """What trains it."""
+        """The trainer of this kind."""
 
     def from_file(
         self, entry: JsonObject, arrays: Mapping[str, npt.NDArray], codes: Sequence[int]
@@ -173,7 +173,7 @@ class EstimatorKind(Protocol):
 
 
 class Preprocessing(Protocol):
-    """What knows the stages that compute a model's dimensions (``preparation``)."""
+    """Knows the stages that compute a model's dimensions (``preparation``)."""
 
     def check(self, preparation: Sequence[StageJson]) -> list[StageJson]:
         """Return the stages in one spelling; ModelError for one that no model may have."""

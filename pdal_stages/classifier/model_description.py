@@ -18,7 +18,7 @@ _Rows = list[tuple[str, str]]
 
 
 class DescribedModel(Protocol):
-    """What the text reads of a ``Model``."""
+    """The part of a ``Model`` that the text reads."""
 
     @property
     def info(self) -> JsonObject:

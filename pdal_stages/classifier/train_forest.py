@@ -50,7 +50,7 @@ _STORED = (
 
 @dataclass(frozen=True)
 class FeatureTrainer:
-    """What trains a kind that learns on features; see :class:`.interface.Trainer`."""
+    """Trains a kind that learns on features; see :class:`.interface.Trainer`."""
 
     name: str  #: of the kind
     learner: type[Learner]

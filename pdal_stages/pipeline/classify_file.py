@@ -39,7 +39,7 @@ def classify_file(
     layout = None
     if is_las(source):  # others are checked when the pipeline is run
         pipeline.check_inputs(pdal=not pipeline.copied)
-        layout = Layout.of(source)
+        layout = Layout.of_file(source)
     if layout is not None and pipeline.is_read_here and writes:
         return _copy(pipeline, request, layout)
     if writes:
@@ -47,7 +47,7 @@ def classify_file(
             _refuse_lost_dimensions(layout, request)
         if listed := extra_dims_option(layout, request.extra_dims):
             pipeline.set_default(-1, extra_dims=listed)
-    own = layout.own if layout else ()
+    own = layout.extra_by_name if layout else ()
     pipeline.select(request.where, {*request.creates} - {*own})
     count = pipeline.execute(arrays=False)
     return count, [*_log_of(pipeline), *pipeline.messages]
@@ -60,7 +60,7 @@ def _log_of(pipeline: Pipeline) -> list[str]:
 def _refuse_lost_dimensions(layout: Layout, request: ClassifyRequest) -> None:
     """Refuse a LAS file with dimensions that PDAL would mix up with those of stages."""
     created = {name.lower() for name in request.creates if name not in request.extra_dims}
-    for name in layout.own:
+    for name in layout.extra_by_name:
         if name.lower() in created or name.startswith(RESERVED):
             raise StageError(
                 f"a stage of the pipeline makes a dimension '{name}', as the input has one, and "

@@ -141,7 +141,7 @@ FLOATS = {"float64": "double", "float32": "float"}
 
 def named_types(layout: Layout) -> dict[str, str]:
     """Return the extra dimensions of a file with PDAL's names of their types."""
-    kinds = {name: layout.type_of(name).name for name in layout.own}
+    kinds = {name: layout.type_of(name).name for name in layout.extra_by_name}
     return {name: FLOATS.get(kind, kind) for name, kind in kinds.items()}
 
 

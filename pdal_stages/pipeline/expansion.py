@@ -232,7 +232,7 @@ def _may_create(name: str, stage: StageJson) -> bool:
         files = readers_files([stage], las=True)
         named = name in str(stage.get("extra_dims", ""))
         layouts = filter(None, map(layout_there, files))
-        return not files or named or any(name in layout.own for layout in layouts)
+        return not files or named or any(name in layout.extra_by_name for layout in layouts)
     if stage["type"] in _CREATES_ANY or name in heights_of(stage):
         return True
     return any(name in str(value) for key, value in stage.items() if key not in ("type", "tag"))

@@ -75,7 +75,7 @@ def _waveforms(path: str, header: LasHeader, reader: StageJson) -> str:
 def _overwritten(path: str, header: LasHeader, reader: StageJson) -> str:
     if reader.keys() & {"extra_dims", "ignore_vlr"}:
         return ""
-    return ", ".join(overwritten_names(Layout.of(path)))
+    return ", ".join(overwritten_names(Layout.of_file(path)))
 
 
 def _odd_text(path: str, header: LasHeader, reader: StageJson) -> str:
@@ -180,7 +180,7 @@ def check_inputs(stages: Sequence[StageJson]) -> None:
 
 def _compare_types(path: str, layout: Layout | None, types: dict[str, tuple[str, str]]) -> None:
     """Refuse an extra dimension of two types: PDAL takes the first for all values."""
-    for name in layout.own if layout else ():
+    for name in layout.extra_by_name if layout else ():
         kind = layout.type_of(name).name  # type: ignore[union-attr]
         first, other = types.setdefault(name.lower(), (kind, path))
         if first != kind:
@@ -196,7 +196,10 @@ def overwritten_names(layout: Layout) -> list[str]:
 
     But for ClassFlags, the copy of the flags that PDAL before 2.3 itself writes with ``all``.
     """
-    own = {_plain(name) for name in layout.names if name not in layout.own} | {"class", "cls"}
+    own = {_plain(name) for name in layout.names if name not in layout.extra_by_name} | {
+        "class",
+        "cls",
+    }
     own.discard("classflags")
     return [each.name for each in layout.extra if _plain(each.name) in own]
 
@@ -309,7 +312,7 @@ def check_flags(stages: Sequence[StageJson]) -> None:
         return
     apart = [w for w in writers if not (writes_las(w) and las_version(w, stages)[1] <= 5)]
     for path in old if apart or len(old) < len(formats) else ():
-        layout = Layout.of(path)
+        layout = Layout.of_file(path)
         for part in read_records(path, layout, only=["Classification"]):
             if (part["class"] > LEGACY_LIMIT).any():
                 what, cure = FLAGS_IN_CLASSES, FLAGS_CURE

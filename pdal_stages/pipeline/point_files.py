@@ -27,7 +27,7 @@ def read_columns(
     The second value of each part tells whether classes hold flags.
     """
     if can_read_chunks(path):
-        layout = Layout.of(path)
+        layout = Layout.of_file(path)
         names = [name for name in (*_ALWAYS, *wanted) if name in layout.names]
         for records in read_records(path, layout, only=names):
             yield {name: layout.column(records, name) for name in names}, False

@@ -19,8 +19,9 @@ from ..base.errors import InterruptedStage, PipelineError, StageError, suggest
 from ..base.files import Output, check_outputs, whole_files
 from ..base.json_types import JsonObject, StageJson
 from ..base.las import refuse_pipe, supersede_copc
-from ..base.las_check import check_complete, check_copc, check_ept, check_readable
+from ..base.las_check import check_complete, check_readable
 from ..base.messages import Report
+from ..base.octrees import check_copc, check_ept
 from ..base.text_points import check_text
 from ..stages.registry import stage_types
 from . import copies, pdal_facts, runtime

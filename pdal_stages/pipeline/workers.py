@@ -65,7 +65,7 @@ def perform_task(task: Task) -> TaskResult:
 
 
 class Workers(Protocol):
-    """What performs tasks: this process, others on this machine, or those of a cluster."""
+    """Performs tasks: this process, others on this machine, or those of a cluster."""
 
     slots: int  #: tasks at the same time
     threads: int  #: threads of each task

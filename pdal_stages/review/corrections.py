@@ -147,7 +147,7 @@ def _correct(
     """
     before = pair.before
     reference = reference_of_file(before)
-    layout = Layout.of(before)
+    layout = Layout.of_file(before)
     las = LasColumns(before, layout)
     xyz = np.column_stack([las[axis] for axis in "XYZ"])
     codes = las["Classification"]
@@ -209,7 +209,7 @@ def _write(
     """
     values = {"Classification": codes, CHECKED: checked.astype(np.uint8)}
     kinds = {CHECKED: "uint8_t"}
-    if "Reliability" in layout.own:
+    if "Reliability" in layout.extra_by_name:
         arrays = {"X": las["X"], "Reliability": las["Reliability"]}
         try:  # of per cent, 1 would be next to nothing
             Points(arrays).reliability  # noqa: B018
@@ -235,7 +235,7 @@ def _edited_codes(
     warnings: list[str],
 ) -> NDArray[np.uint8]:
     """Return the classes of the same points in another file; their former ones where missing."""
-    other = LasColumns(after, Layout.of(after))
+    other = LasColumns(after, Layout.of_file(after))
     theirs = np.column_stack([other[axis] for axis in "XYZ"])
     steps = np.maximum(las.layout.header.scales, other.layout.header.scales)
     names = [name for name in _DISTINGUISHING if name in las and name in other]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.dimensions import HEIGHT, Dimension
-from ..terrain.minima import check_sizes, hag_minima, terrain_reach
+from ..terrain.minima import CELL_M, RESOLUTION_M, check_sizes, hag_minima, terrain_reach
 from .base import HEIGHTS_OUTSIDE, Stage, StageContext
 from .options import Selection, ignore_option, option
 from .points import Points
@@ -25,14 +25,14 @@ class HagMinima(Stage):
     in_models = ("cell", "resolution", "ignore", "where")
     cell: float = option(
         "number",
-        20.0,
+        CELL_M,
         "Side of the coarse cells whose lowest points form the terrain; more than half the width "
         "of the largest building",
         *(0.05, 10_000),
         unit="m",
     )
     resolution: float = option(
-        "number", 0.5, "Side of the fine cells of the terrain", 0.05, 10_000, unit="m"
+        "number", RESOLUTION_M, "Side of the fine cells of the terrain", 0.05, 10_000, unit="m"
     )
     ignore: Selection = ignore_option("Points that do not form the terrain but get heights")
 

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TileCells:
-    """What the tiles of a survey were reduced to, by :func:`.cells.reduce_points`."""
+    """The rasters to which the tiles of a survey were reduced, by :func:`.cells.reduce_points`."""
 
     options: SurfaceOptions
     grid: TileGrid

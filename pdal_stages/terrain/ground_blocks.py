@@ -49,7 +49,7 @@ def _steps_of_block(options: FilterOptions) -> Chain:
 
 
 class KnownCells(NamedTuple):
-    """What an earlier round made of the cells of a window."""
+    """The cells of a window, as an earlier round made them."""
 
     raster: GroundRaster
     means: CellMeans  #: of their ground points

@@ -22,6 +22,10 @@ from ..base.grid import cell_keys, cell_numbers, places_among
 from ..base.json_types import JsonObject
 from .cells import columns, usable
 
+#: Side of the cells whose lowest points form the terrain, and of the cells that it is
+#: interpolated to, in meters [W18 section 3.2].
+CELL_M, RESOLUTION_M = 20.0, 0.5
+
 
 def _filled(
     keys: NDArray[np.int64], minima: NDArray[np.float64], wanted: NDArray[np.int64]
@@ -72,8 +76,8 @@ def hag_minima(
     y: ArrayLike | None = None,
     z: ArrayLike | None = None,
     *,
-    cell: float = 20.0,
-    resolution: float = 0.5,
+    cell: float = CELL_M,
+    resolution: float = RESOLUTION_M,
     mask: ArrayLike | None = None,
     wanted: ArrayLike | None = None,
     figures: JsonObject | None = None,

@@ -307,7 +307,7 @@ def _collect(views: list[dict[str, NDArray]], pieces: list[Piece]) -> list[Piece
 
 @dataclass
 class _TileHalo:
-    """How far around a tile points are read, and whether that suffices."""
+    """The halo of a tile: how far around it points are read, and whether that suffices."""
 
     context: RunContext
     number: int  #: of the round
@@ -344,7 +344,7 @@ class _TileHalo:
 
 @dataclass
 class TileRecord:
-    """What is known of a tile that ran."""
+    """The record of a tile that ran."""
 
     points: int  #: of the tile
     read: int  #: with its halo

@@ -51,7 +51,7 @@ def sort_points(path: str, grid: TileGrid, target: str) -> JsonObject:
 
     :class:`CloudIndex` parses it.
     """
-    layout = Layout.of(path)
+    layout = Layout.of_file(path)
     dtype, cells = _copy_type(layout), grid.scaled(1 / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     parts = [np.empty((0, 4), np.int64)]
@@ -151,7 +151,7 @@ def cut_all(
     pieces = []
     for source in sources:
         assert source.index is not None
-        layout = Layout.of(source.path)
+        layout = Layout.of_file(source.path)
         numbers, records = points_near(layout, source.index, box)
         if not len(records):
             continue

@@ -204,7 +204,7 @@ def points_of_tile(grid: TileGrid, tile: Tile, sources: Sequence[InputSource]) -
     parts: list[Part] = []
     for source in sources:
         assert source.index is not None
-        layout = Layout.of(source.path)
+        layout = Layout.of_file(source.path)
         records = points_near(layout, source.index, grid.box(tile))[1]
         x, y = layout.column(records, "X"), layout.column(records, "Y")
         inside = (grid.index(x) == tile[0]) & (grid.index(y) == tile[1])

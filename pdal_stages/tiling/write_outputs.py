@@ -169,7 +169,7 @@ def run_tail(
             each.write(path)
             reader = {**source.reader, "filename": str(path), "tag": f"in{number}"}
             stages.append({**reader, "use_eb_vlr": True})
-            listed |= named_types(Layout.of(path))
+            listed |= named_types(Layout.of_file(path))
         stages.append({"type": "filters.merge", "inputs": [stage["tag"] for stage in stages]})
         dimensions = ",".join(f"{name}={kind}" for name, kind in listed.items())
         for stage in plan.per_output:
@@ -212,7 +212,7 @@ def write_file(
     It has class counts.
     """
     assert source.index is not None
-    count, layout = source.index.count, Layout.of(source.path)
+    count, layout = source.index.count, Layout.of_file(source.path)
 
     def parts() -> Iterator[tuple[NDArray, NewValues]]:
         for start in range(0, count, MOST_AT_ONCE):

@@ -27,8 +27,8 @@ import numpy as np
 from pdal_stages import TrainingCloud, TrainingOptions, load_model, train
 from pdal_stages.base import las, las_check
 from pdal_stages.base.errors import StageError
-from pdal_stages.base.las_check import check_ept
 from pdal_stages.base.las_points import Layout
+from pdal_stages.base.octrees import check_ept
 from pdal_stages.classifier import model_file
 from pdal_stages.classifier.interface import classifier_of
 from pdal_stages.classifier.model import assemble
@@ -150,7 +150,7 @@ def cloud(data: bytes) -> str:
     path = put("cloud.laz", data)
     las_check.check_readable(path)
     las.projection_digest(path)
-    assert Layout.of(path).names
+    assert Layout.of_file(path).names
     extent = inputs.las_extent(str(path))
     assert (
         sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"]
