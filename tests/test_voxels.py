@@ -24,7 +24,7 @@ def test_one_of_each_voxel(side):
     voxels = represent(xyz, side)
     voxel = [tuple(np.floor(p * (1.0 / side))) for p in xyz]
     assert voxels is not None
-    points, place = voxels.members(np.arange(len(voxels.rows)))
+    points, place = voxels.members.take(np.arange(len(voxels.rows)))
     assert sorted(points) == list(range(len(xyz)))
     assert all(voxel[p] == voxel[r] for p, r in zip(points, voxels.rows[place], strict=True))
     assert len(voxels.rows) == len(set(voxel))
@@ -57,7 +57,7 @@ def test_points_asked_for():
     xyz = crowd()
     rows = np.flatnonzero(np.arange(len(xyz)) % 5 == 0)
     voxels = represent(xyz, 0.25, (), rows)
-    points, _ = voxels.members(voxels.wanted)
+    points, _ = voxels.members.take(voxels.members.wanted())
     assert np.array_equal(np.sort(points), rows)
 
 
@@ -91,7 +91,7 @@ def test_members_get_the_same(model, how, tmp_path):
         a, b = getattr(prediction, name), getattr(thin, name)
         if a is not None:
             assert np.array_equal(a[stands][both], b[both])
-    points, place = few.members(np.arange(len(few.rows)))
+    points, place = few.members.take(np.arange(len(few.rows)))
     inside = where[points] & where[stands[place]]
     assert np.array_equal(
         prediction.reliability[points][inside], prediction.reliability[stands[place]][inside]

@@ -236,11 +236,15 @@ class Layout:
             raise KeyError(name)
         values = records[name]
         if name in "XYZ":
-            axis = "XYZ".index(name)
-            return values * self.header.scales[axis] + self.header.offsets[axis]
+            return self.scaled(name, values)
         if name == "ScanAngleRank" and not self.is_old:
             values = values * _ANGLE_STEP
         return values.astype(self.type_of(name))
+
+    def scaled(self, axis: str, steps: NDArray) -> NDArray[np.float64]:
+        """Return coordinates (n,) along X, Y or Z of the whole numbers that records hold."""
+        number = "XYZ".index(axis)
+        return steps * self.header.scales[number] + self.header.offsets[number]
 
     def put(self, records: NDArray, name: str, values: NDArray) -> None:
         """Set a dimension (n,) of records (n,); a value that does not fit is cut off."""
@@ -377,7 +381,10 @@ USUAL = ("X", "Y", "Z", "Classification", "ReturnNumber", "NumberOfReturns", "Wi
 
 @dataclass(eq=False)
 class LasColumns(Mapping[str, NDArray]):
-    """The dimensions of a file by name, each read when it is asked for and then kept."""
+    """The dimensions of a file by name, each read when it is asked for and then kept.
+
+    Coordinates are kept as the whole numbers of the file, in half the memory.
+    """
 
     path: str
     layout: Layout
@@ -390,16 +397,18 @@ class LasColumns(Mapping[str, NDArray]):
                 raise KeyError(name)
             wanted = USUAL if name in USUAL and not self._read.keys() & {*USUAL} else (name,)
             self.load([each for each in wanted if each in self.layout.names])
-        return self._read[name]
+        values = self._read[name]
+        return self.layout.scaled(name, values) if name in "XYZ" else values
 
     def load(self, names: Sequence[str]) -> None:
         """Read dimensions, all in one pass."""
-        count = self.layout.header.count
-        new = {name: np.empty(count, self.layout.type_of(name)) for name in names}
-        at = 0
-        for records in read_records(self.path, self.layout, only=names):
+        layout, at = self.layout, 0
+        kinds = {n: layout.dtype[n] if n in "XYZ" else layout.type_of(n) for n in names}
+        new = {name: np.empty(layout.header.count, kind) for name, kind in kinds.items()}
+        for records in read_records(self.path, layout, only=names):
             for name, values in new.items():
-                values[at : at + len(records)] = self.layout.column(records, name)
+                part = records[name] if name in "XYZ" else layout.column(records, name)
+                values[at : at + len(records)] = part
             at += len(records)
         self._read |= new
 

@@ -54,7 +54,7 @@ def list_values(
     names: Iterable[str],
     dimensions: Mapping[str, npt.ArrayLike],
     n: int,
-    rows: npt.NDArray[np.int64] | None = None,
+    rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_] | None = None,
     where: str | None = None,
 ) -> list[npt.NDArray]:
     """Return the values (n,) of the dimensions that features use.
@@ -89,7 +89,7 @@ def take_dimensions(
     names: Iterable[str],
     dimensions: Mapping[str, npt.ArrayLike],
     n: int,
-    rows: npt.NDArray[np.int64] | None = None,
+    rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_] | None = None,
     where: str | None = None,
 ) -> dict[str, npt.NDArray]:
     """Return by name, but for coordinates, the dimensions at some rows of a cloud of n points.
@@ -99,7 +99,7 @@ def take_dimensions(
     names : iterable of str
     dimensions : mapping of str to (n,) array
         See :func:`add_surroundings`.
-    rows : (m,) int64, optional
+    rows : (m,) int64 or (n,) bool, optional
         All n by default.
     where : str, optional
         The cloud's name, for messages.

@@ -229,21 +229,48 @@ class Model:
         **options
             See :class:`PredictionOptions`.
         """
+        xyz = check_xyz(xyz)
+        roles = PointRoles.check(len(xyz), where, ignore, current, may_be_ground)
         how = PredictionOptions(**options)
+        return self.classify(xyz, dict(dimensions or {}), roles, how, progress)
+
+    def classify(
+        self,
+        xyz: npt.NDArray[np.float64],
+        dimensions: Mapping[str, npt.ArrayLike],
+        roles: PointRoles,
+        how: PredictionOptions,
+        progress: Progress | None = None,
+    ) -> Prediction:
+        """Classify a cloud as :meth:`predict` does, which explains the parameters.
+
+        Coordinates (n, 3) that the caller does not hold are freed before most memory is taken.
+        """
         if how.variance and not self.gives_variance:
             raise OptionError("only a network gives a variance", cure="Ask for the margin")
         xyz = check_xyz(xyz)
-        roles = PointRoles.check(len(xyz), where, ignore, current, may_be_ground)
-        dimensions = self._add_preprocessed(xyz, dict(dimensions or {}), roles, how.threads)
+        dimensions = self._add_preprocessed(xyz, dimensions, roles, how.threads)
         columns = empty_columns(roles, len(self.classes), how)
-        values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.present)
-        representatives = represent(xyz, self.voxel, values, roles.wanted_rows, roles.present)
+        values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.usable)
+        wanted_rows = roles.wanted_rows
+        representatives = represent(xyz, self.voxel, values, wanted_rows, roles.usable)
         if representatives is not None:  # the coordinates of the others are not needed any more
             xyz = xyz[representatives.rows]
+        names = (*self.required_dimensions, *self.optional_dimensions)
+        read = {name: dimensions[name] for name in names if name in dimensions}
         cell = getattr(self.passes[0].plan, "cell", 1.0)
-        work = WorkingCloud.sort(xyz, cell, representatives, roles.wanted_rows)
-        del xyz, values
-        request = self._request(work, dimensions, how, progress)
+        work = WorkingCloud.sort(xyz, read, cell, representatives, wanted_rows)
+        del xyz, values, representatives, wanted_rows
+        request = PredictRequest(
+            work.xyz,
+            work.dimensions,
+            work.wanted,
+            how.threads,
+            how.memory_mb,
+            None if work.stands_for_others else progress,
+            work.grid,
+            how.device,
+        )
         self._classify(work, request, columns, progress)
         if roles.not_ground is not None:
             request.report.figures["too_far_for_ground"] = move_from_ground(columns, roles)
@@ -257,10 +284,10 @@ class Model:
     def _add_preprocessed(
         self,
         xyz: npt.NDArray[np.float64],
-        dimensions: dict[str, npt.ArrayLike],
+        dimensions: Mapping[str, npt.ArrayLike],
         roles: PointRoles,
         threads: int | None,
-    ) -> dict[str, npt.ArrayLike]:
+    ) -> Mapping[str, npt.ArrayLike]:
         """Return the dimensions (n,), and heights as computed in training where they miss.
 
         None is computed where some are there: heights of two kinds would be mixed.
@@ -271,26 +298,6 @@ class Model:
             self.preparation, xyz, roles.usable, threads, roles.current
         )
         return dimensions if computed.keys() & dimensions.keys() else {**computed, **dimensions}
-
-    def _request(
-        self,
-        work: WorkingCloud,
-        dimensions: Mapping[str, npt.ArrayLike],
-        how: PredictionOptions,
-        progress: Progress | None,
-    ) -> PredictRequest:
-        """Return the request for the points in work."""
-        names = (*self.required_dimensions, *self.optional_dimensions)
-        return PredictRequest(
-            work.xyz,
-            work.take(names, dimensions),
-            work.wanted,
-            how.threads,
-            how.memory_mb,
-            None if work.stands_for_others else progress,
-            work.grid,
-            how.device,
-        )
 
     def _classify(
         self,

@@ -8,7 +8,7 @@ was given, ``rows_in_work`` of the points that are computed (:class:`WorkingClou
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from ..base.json_types import JsonObject
 from ..base.messages import Report
 from ..base.options import Settings, setting
 from ..features.point_grid import CellGrid, build_grid
-from ..features.voxels import Representatives
+from ..features.voxels import Members, Representatives
 from .calibration import ReliabilityLimits
 from .interface import Block
 
@@ -89,8 +89,7 @@ class PointRoles:
     """Roles of the points of a cloud: to classify, only neighbors, or ignored."""
 
     wanted: npt.NDArray[np.bool_]  #: (n,) points to classify
-    #: (k,) rows in the cloud of points that are not ignored; None: all
-    present: npt.NDArray[np.int64] | None
+    usable: npt.NDArray[np.bool_] | None  #: (n,) points that are not ignored; None: all
     current: npt.NDArray[np.uint8] | None  #: (n,) class codes that the points have now
     not_ground: npt.NDArray[np.bool_] | None  #: (n,) points to classify that must not become ground
 
@@ -105,15 +104,15 @@ class PointRoles:
     ) -> PointRoles:
         """Return the roles of n points from arguments of ``Model.predict``, checked."""
         wanted = np.ones(n, np.bool_) if where is None else _column("where", where, n, np.bool_)
-        present = codes = not_ground = None
+        usable = codes = not_ground = None
         if ignore is not None and (ignored := _column("ignore", ignore, n, np.bool_)).any():
-            present = np.flatnonzero(~ignored)
-            wanted = wanted & ~ignored
+            usable = ~ignored
+            wanted = wanted & usable
         if current is not None:
             codes = _column("current", current, n, np.uint8)
         if may_be_ground is not None:
             not_ground = wanted & ~_column("may_be_ground", may_be_ground, n, np.bool_)
-        return cls(wanted, present, codes, not_ground)
+        return cls(wanted, usable, codes, not_ground)
 
     @property
     def wanted_rows(self) -> npt.NDArray[np.int64] | None:
@@ -121,18 +120,9 @@ class PointRoles:
         return None if self.wanted.all() else np.flatnonzero(self.wanted)
 
     @property
-    def usable(self) -> npt.NDArray[np.bool_] | None:
-        """(n,) points that are not ignored; None: all."""
-        if self.present is None:
-            return None
-        usable = np.zeros(len(self.wanted), np.bool_)
-        usable[self.present] = True
-        return usable
-
-    @property
     def ignored(self) -> int:
         """Number of points that are ignored."""
-        return 0 if self.present is None else len(self.wanted) - len(self.present)
+        return 0 if self.usable is None else int(np.count_nonzero(~self.usable))
 
 
 def _column(name: str, values: npt.ArrayLike, n: int, dtype: type) -> npt.NDArray:
@@ -152,17 +142,17 @@ class WorkingCloud:
     """Points that are computed, in the order of the grid: one for each voxel, none ignored."""
 
     xyz: npt.NDArray[np.float64]  #: (k, 3) meters
+    dimensions: dict[str, npt.NDArray]  #: (k,) values by name
     #: rows in work that stand for points to classify, ascending; None: all
     wanted: npt.NDArray[np.int64] | None
     grid: CellGrid  #: the index of `xyz`
-    rows_in_cloud: npt.NDArray  #: (k,) of the points themselves
-    _order: npt.NDArray  #: (k,) place of each among the representatives
-    _representatives: Representatives | None
+    _members: Members | npt.NDArray  #: (k,) rows in the cloud where each stands for itself
 
     @classmethod
     def sort(
         cls,
         xyz: npt.NDArray[np.float64],
+        dimensions: Mapping[str, npt.ArrayLike],
         cell: float,
         representatives: Representatives | None,
         wanted_rows: npt.NDArray[np.int64] | None,
@@ -173,6 +163,8 @@ class WorkingCloud:
         ----------
         xyz : (k, 3) float64
             Of the representatives, where there are any.
+        dimensions : mapping of str to (n,) array
+            Of the cloud.
         cell : float
             Side of the grid's cells, meters.
         representatives : Representatives or None
@@ -183,35 +175,31 @@ class WorkingCloud:
         """
         grid = build_grid(xyz, cell)
         order = grid.order
-        wanted, rows_in_cloud = wanted_rows, order
-        if representatives is not None:
-            wanted, rows_in_cloud = representatives.wanted, representatives.rows[order]
-            representatives = replace(representatives, rows=order[:0])
-        if wanted is not None:
-            wanted = np.flatnonzero(np.isin(order, wanted))
-        sorted_grid = grid._replace(order=np.arange(len(order), dtype=order.dtype))
-        return cls(grid.xyz.T, wanted, sorted_grid, rows_in_cloud, order, representatives)
+        grid = grid._replace(order=np.arange(len(order), dtype=order.dtype))
+        if representatives is None:
+            rows_in_cloud, wanted = order, wanted_rows
+            if wanted is not None:
+                wanted = np.flatnonzero(np.isin(order, wanted))
+            members: Members | npt.NDArray = order
+        else:
+            rows_in_cloud = representatives.rows[order]
+            members = representatives.members.reorder(order)
+            wanted = members.wanted()
+        taken = {name: np.asarray(values)[rows_in_cloud] for name, values in dimensions.items()}
+        return cls(grid.xyz.T, taken, wanted, grid, members)
 
     @property
     def stands_for_others(self) -> bool:
         """True where a point in work may stand for several points, or for none."""
-        return self._representatives is not None
-
-    def take(
-        self, names: Iterable[str], dimensions: Mapping[str, npt.ArrayLike]
-    ) -> dict[str, npt.ArrayLike]:
-        """Return the values (k,) of those of the dimensions (n,) that are there."""
-        there = [name for name in names if name in dimensions]
-        return {name: np.asarray(dimensions[name])[self.rows_in_cloud] for name in there}
+        return isinstance(self._members, Members)
 
     def members(
         self, rows_in_work: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray, npt.NDArray[np.int64] | slice]:
         """Return the cloud's rows that a block stands for, and the block's row for each."""
-        rows = self._order[rows_in_work]
-        if self._representatives is None:
-            return rows, slice(None)
-        return self._representatives.members(rows)
+        if isinstance(self._members, Members):
+            return self._members.take(rows_in_work)
+        return self._members[rows_in_work], slice(None)
 
 
 def empty_columns(

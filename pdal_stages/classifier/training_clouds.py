@@ -124,7 +124,7 @@ def _cleaned(cloud: TrainingCloud, options: TrainingOptions) -> TrainingCloud:
     usable = np.isin(labels, list(named)) if named else ~np.isin(labels, _left_out(options))
     if cloud.mask is not None:
         usable &= np.asarray(cloud.mask)
-    points, place = representatives.members(slice(None))
+    points, place = representatives.members.take(slice(None))
     good = usable[points]
     least = np.full(len(rows), MAX_LABEL + 1, np.int64)
     np.minimum.at(least, place[good], labels[points[good]])

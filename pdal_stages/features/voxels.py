@@ -35,18 +35,13 @@ def check_side(side: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Representatives:
-    """Points that stand for others."""
+class Members:
+    """The points that each of k representatives stands for."""
 
-    #: The representatives' rows in the cloud, ascending.
-    rows: npt.NDArray
-    #: Those of them, by their place in `rows`, ascending, that stand for a point that was asked
-    #: for; None: all.
-    wanted: npt.NDArray[np.int64] | None
-    _members: npt.NDArray  # points asked for, by representative
-    _start: npt.NDArray
+    _rows: npt.NDArray  #: (m,) rows in the cloud, representative by representative
+    _start: npt.NDArray  #: (k + 1,) where those of each begin
 
-    def members(
+    def take(
         self, block: npt.NDArray[np.int64] | slice
     ) -> tuple[npt.NDArray, npt.NDArray[np.int64]]:
         """Return the points that a block of representatives stands for, and their place in it."""
@@ -54,7 +49,26 @@ class Representatives:
         number = last - first
         place = np.repeat(np.arange(len(number)), number)
         before = np.cumsum(number) - number
-        return self._members[np.arange(len(place)) + (first - before)[place]], place
+        return self._rows[np.arange(len(place)) + (first - before)[place]], place
+
+    def wanted(self) -> npt.NDArray[np.int64] | None:
+        """Return which representatives stand for any point, ascending; None: all."""
+        wanted = np.flatnonzero(np.diff(self._start))
+        return None if 0 < len(wanted) == len(self._start) - 1 else wanted
+
+    def reorder(self, order: npt.NDArray) -> Members:
+        """Return the members of the representatives in another order."""
+        rows, start = np.empty_like(self._rows), np.empty_like(self._start)
+        copy_members(self._rows, self._start, order, rows, start)
+        return Members(rows, start)
+
+
+@dataclass(frozen=True, eq=False)
+class Representatives:
+    """Points that stand for others."""
+
+    rows: npt.NDArray  #: (k,) their rows in the cloud, ascending
+    members: Members  #: points asked for, by representative
 
 
 def represent(
@@ -62,28 +76,26 @@ def represent(
     side: float,
     values: Iterable[npt.ArrayLike] = (),
     rows: npt.NDArray[np.int64] | None = None,
-    present: npt.NDArray[np.int64] | None = None,
+    usable: npt.NDArray[np.bool_] | None = None,
 ) -> Representatives | None:
     """Return representatives of a cloud's points, or None where each stands for itself.
 
     `side` is a voxel's, in meters as `xyz`; 0 for none. `values` (n,) are what else is known of
     the points, and decide between points of the same coordinates. `rows` (m,) are the points asked
-    for; the others are represented too, but are not listed. `present` (k,) are the points that are
-    there at all, `rows` among them (default: all n). Both ascend.
+    for, ascending; the others are represented too, but are not listed. `usable` (n,) tells which
+    points are there at all, `rows` among them (default: all).
     """
     check_side(side)
     small = np.int32 if len(xyz) < 2**31 else np.int64
-    by = _one_each(xyz, side, values, present) if side and len(xyz) else None
-    if by is None and present is None:
+    by = _one_each(xyz, side, values, usable) if side and len(xyz) else None
+    if by is None and usable is None:
         return None
     is_kept = np.zeros(len(xyz), np.bool_)
-    is_kept[present if by is None else by] = True  # by itself for points that are not there
-    if present is not None:
-        gone = np.ones(len(xyz), np.bool_)
-        gone[present] = False
-        is_kept[gone] = False
-        rows = present if rows is None else rows
-    kept = np.flatnonzero(is_kept)
+    is_kept[slice(None) if by is None else by] = True  # by itself for points that are not there
+    if usable is not None:
+        is_kept &= usable
+        rows = np.flatnonzero(usable) if rows is None else rows
+    kept = np.flatnonzero(is_kept).astype(small)
     place: npt.NDArray = np.cumsum(is_kept, dtype=small)
     np.subtract(place, 1, out=place)
     if by is not None:
@@ -92,27 +104,25 @@ def represent(
     members = np.argsort(place, kind="stable").astype(small)
     start = np.searchsorted(place[members], np.arange(len(kept) + 1)).astype(small)
     members = members if rows is None else rows[members].astype(small)
-    wanted = np.flatnonzero(np.diff(start))
-    return Representatives(
-        kept.astype(small), None if 0 < len(wanted) == len(kept) else wanted, members, start
-    )
+    return Representatives(kept, Members(members, start))
 
 
 def _one_each(
     xyz: npt.NDArray[np.float64],
     side: float,
     values: Iterable[npt.ArrayLike],
-    present: npt.NDArray[np.int64] | None,
+    usable: npt.NDArray[np.bool_] | None,
 ) -> npt.NDArray | None:
     """Return the point (n,) that stands for each; None where no voxel holds two.
 
-    Points that are not `wanted` stand for themselves.
+    Points that are not `usable` stand for themselves.
     """
     keys, _ = compact_keys(xyz, side)
-    if present is None:
+    if usable is None:
         order = np.argsort(keys)
     else:
-        order = present[np.argsort(keys[present])]
+        there = np.flatnonzero(usable)
+        order = there[np.argsort(keys[there])]
     by = np.arange(len(xyz), dtype=np.int32 if len(xyz) < 2**31 else np.int64)
     single = choose_one_each(order, keys[order], hash_rows([*xyz.T, *values], 0), by)
     return None if single else by
@@ -139,3 +149,15 @@ def choose_one_each(order, keys, hashes, by):
         single = single and end == start + 1
         start = end
     return single
+
+
+@njit
+def copy_members(rows, start, order, new_rows, new_start):
+    """Fill `new_rows` and `new_start` with the members of representatives in another order."""
+    end = 0
+    for k in range(len(order)):
+        new_start[k] = end
+        for i in range(start[order[k]], start[order[k] + 1]):
+            new_rows[end] = rows[i]
+            end += 1
+    new_start[len(order)] = end

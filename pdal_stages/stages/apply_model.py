@@ -27,13 +27,13 @@ from ..base.dimensions import (
     probability,
 )
 from ..base.errors import OptionError
-from ..base.json_types import JsonObject, StageJson
+from ..base.json_types import StageJson
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, is_too_flat, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
-from ..classifier.prediction import UNCLASSIFIED, Prediction, PredictionOptions
+from ..classifier.prediction import UNCLASSIFIED, PointRoles, Prediction, PredictionOptions
 from ..terrain.filter_options import FilterOptions
 from .base import Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
@@ -233,10 +233,10 @@ class ApplyModel(Stage, settings=PredictionOptions):
         return unsure if self.rejected_code is None else self.rejected_code
 
     @property
-    def _prediction(self) -> JsonObject:
-        """Return the values of :class:`PredictionOptions`."""
+    def _prediction(self) -> PredictionOptions:
+        """Return the options of classifying a cloud."""
         values = {field.name: getattr(self, field.name) for field in fields(PredictionOptions)}
-        return values | {"rejected_code": self._rejected}
+        return PredictionOptions(**{**values, "rejected_code": self._rejected})
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Classify the points."""
@@ -263,15 +263,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
                 too_flat = is_too_flat(points.dimension(_HEIGHT), returns)
         points.keep_only([*dimensions, *self.creates(), _HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
-            prediction = self.model.predict(
-                points.take_xyz(),
-                dimensions,
-                None if wanted.all() else wanted,
-                current=current,
-                ignore=ignored if ignored.any() else None,
-                may_be_ground=ground,
-                progress=progress,
-                **self._prediction,
+            roles = PointRoles.check(points.count, wanted, ignored, current, ground)
+            prediction = self.model.classify(
+                points.take_xyz(), dimensions, roles, self._prediction, progress
             )
         rejected = np.zeros(points.count, np.bool_)
         rejected[prediction.unsure] = True
