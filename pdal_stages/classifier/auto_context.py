@@ -11,7 +11,7 @@ image segmentation.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,7 +24,15 @@ from ..features import FeaturePlan
 from ..features.engine import FeatureBlock, Run
 from .context_features import HEIGHT, CellContext, Context, count_shares, rows_needed
 from .feature_forest import CloudFeatures, FeatureForest, FeatureReader, Features
-from .interface import Block, Estimator, InputPlan, PointEstimator, PredictRequest, weigh
+from .interface import (
+    Block,
+    Estimator,
+    InputPlan,
+    PassInputs,
+    PointEstimator,
+    PredictRequest,
+    weigh,
+)
 
 #: Points of a band at most, but for a band of one strip: the features of a few bands are held (not
 #: tuned; results do not depend on it).
@@ -220,8 +228,22 @@ class PassRun:
             )
         weighted = self._passes[step] if step < len(self._passes) else None
         return _StepOnBand(
-            weighted, step < self._last, columns, self._strips, band[1].start, self._wanted[step]
+            weighted,
+            step < self._last,
+            columns,
+            self._strips,
+            band[1].start,
+            self._wanted[step],
+            self._observe(step),
         )
+
+    def _observe(self, step: int) -> Callable[..., None] | None:
+        """Return a function that hands on what a step read; None where nobody wants it."""
+        request = self._request
+        if request.observe is None:
+            return None
+        hand_on = request.observe
+        return lambda rows, *read: hand_on(PassInputs(step, rows, request.xyz[rows], *read))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +260,7 @@ class _StepOnBand:
     first_place: int  #: of the points of `context`, among the strips
     #: of rows in the request's cloud: those that the step must look at; None: all
     mask: npt.NDArray[np.bool_] | None
+    observe: Callable[..., None] | None  #: receives rows, what a pass reads, and probabilities
     run: Run | None = None  #: that computes the features
     keep: bool = False  #: whether a later step needs the features
 
@@ -268,7 +291,10 @@ class _StepOnBand:
             return read
         classifier, _, factors = self.weighted_pass
         assert isinstance(classifier, FeatureReader)
-        p = weigh(classifier.probabilities(read, rows), factors)
+        own = classifier.probabilities(read, rows)
+        if self.observe is not None:
+            self.observe(rows, read, own)
+        p = weigh(own, factors)
         return count_shares(p) if self.hands_on else p
 
 

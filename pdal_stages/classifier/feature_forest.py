@@ -17,7 +17,7 @@ from ..features.engine import FeatureBlock, Run
 from .context_features import OWN, Context
 from .input_dimensions import add_surroundings, take_dimensions
 from .interface import FOREST, REFINED_FOREST, Estimator, PredictRequest
-from .learner import Learner
+from .learner import ContributingLearner, Learner
 
 #: Blocks of features get so many megabytes at least, whatever the request says (not tuned).
 _LEAST_MB = 16.0
@@ -296,3 +296,43 @@ class FeatureForest:
             return by_forest
         read = values[:, len(self.plan.names) :]
         return self.blend(self.context.own_probabilities(read, len(self.blend.before)), by_forest)
+
+    def contributions(
+        self, values: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
+        """Return what each input adds to the probabilities; None of a learner that cannot tell.
+
+        What a refined forest takes over from its base is added by the base's probabilities, all by
+        the first of them.
+
+        Parameters
+        ----------
+        values : (n, inputs) float32
+            Features and context.
+
+        Returns
+        -------
+        start : (classes,) float64
+            Probabilities before any input.
+        added : (n, inputs, classes) float64
+            `start` plus the sum over the inputs are the probabilities.
+        """
+        if not isinstance(self.forest, ContributingLearner):
+            return None
+        start, added = self.forest.contributions(values)
+        if self.blend is None or self.context is None:
+            return start, added
+        read = values[:, len(self.plan.names) :]
+        base = self.context.own_probabilities(read, len(self.blend.before))
+        roots = np.broadcast_to(start, (len(values), len(start)))
+        before = self.blend(base, roots)
+        out = np.stack(
+            [self.blend(base, start + part) - before for part in added.swapaxes(0, 1)], axis=1
+        )
+        whole = np.zeros(len(self.blend.codes))
+        whole[np.searchsorted(self.blend.codes, self.blend.labeled)] = start
+        first = self.context.names(self.blend.before).index(
+            f"Probability_{self.blend.before[0]}_{OWN}"
+        )
+        out[:, len(self.plan.names) + first] += before - whole
+        return whole, out

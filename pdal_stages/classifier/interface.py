@@ -49,6 +49,20 @@ class InputPlan:
     halo_m: float  #: meters around a tile whose points the tile's results depend on
 
 
+class PassInputs(NamedTuple):
+    """What a pass read of some points, and the probabilities that it gave them."""
+
+    number: int  #: of the pass, from 0
+    rows: npt.NDArray[np.int64]  #: (b,) rows in the cloud
+    xyz: npt.NDArray[np.float64]  #: (b, 3) of the points that are computed for these, in meters
+    values: npt.NDArray[np.float32]  #: (b, inputs)
+    probabilities: npt.NDArray[np.float64]  #: (b, classes) before any factors
+
+
+#: Receives what passes read.
+Observe = Callable[[PassInputs], None]
+
+
 @dataclass(frozen=True, eq=False)
 class PredictRequest:
     """A cloud, and the points of it that are to be classified."""
@@ -62,6 +76,8 @@ class PredictRequest:
     progress: Progress | None = None  #: is told of the points done
     grid: CellGrid | None = None  #: the index of the cloud, which lies in its order
     device: str = "cpu"  #: where a network is applied
+    #: receives what passes that read features read of each block
+    observe: Observe | None = None
     #: what is counted, complete when all blocks are read
     report: Report = field(default_factory=Report)
 

@@ -8,7 +8,7 @@ cross-validation and calibration as the forest does, and is applied in tiles lik
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Protocol, TypeVar
+from typing import ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -66,3 +66,16 @@ class Learner(Protocol):
 
     def predict_proba(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         """Return class probabilities (n, classes) of rows (n, features)."""
+
+
+@runtime_checkable
+class ContributingLearner(Learner, Protocol):
+    """A learner that tells what each feature adds to a probability."""
+
+    def contributions(
+        self, values: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return probabilities (classes,) before any feature, and what features add to them.
+
+        The latter are (n, features, classes) for rows (n, features); both sum to the probabilities.
+        """

@@ -270,6 +270,7 @@ class Model:
             None if work.stands_for_others else progress,
             work.grid,
             how.device,
+            work.observe(how.observe),
         )
         self._classify(work, request, columns, progress)
         if roles.not_ground is not None:

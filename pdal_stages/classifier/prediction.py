@@ -21,7 +21,7 @@ from ..base.options import Settings, setting
 from ..features.point_grid import CellGrid, build_grid
 from ..features.voxels import Members, Representatives
 from .calibration import ReliabilityLimits
-from .interface import Block
+from .interface import Block, Observe, PassInputs
 
 #: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
 UNCLASSIFIED = 1
@@ -67,6 +67,8 @@ class PredictionOptions(Settings):
     )
     #: as `reject_below`, by class; the larger one counts
     limits: ReliabilityLimits | None = None
+    #: receives what each pass read of the points that are computed for those to classify
+    observe: Observe | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +194,21 @@ class WorkingCloud:
     def stands_for_others(self) -> bool:
         """True where a point in work may stand for several points, or for none."""
         return isinstance(self._members, Members)
+
+    def observe(self, observe: Observe | None) -> Observe | None:
+        """Return a function that hands on the inputs of the points to classify, by their rows."""
+
+        def hand_on(inputs: PassInputs) -> None:
+            assert observe is not None
+            chosen = np.arange(len(inputs.rows))
+            if self.wanted is not None:
+                chosen = np.flatnonzero(np.isin(inputs.rows, self.wanted))
+            rows_in_cloud, place = self.members(inputs.rows[chosen])
+            number, _, xyz, values, shares = inputs
+            at = chosen[place]
+            observe(PassInputs(number, rows_in_cloud, xyz[at], values[at], shares[at]))
+
+        return None if observe is None else hand_on
 
     def members(
         self, rows_in_work: npt.NDArray[np.int64]

@@ -165,6 +165,64 @@ class Forest:
         walk(values, self.tree_sizes, self._nodes, self._shares, out)  # type: ignore[attr-defined]
         return out / self.n_trees
 
+    def contributions(
+        self, values: npt.NDArray[np.float32]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return what each feature adds to the probabilities along the paths through the trees.
+
+        A split adds the change of the classes' shares to its feature. Inner nodes have the counts
+        of their leaves together.
+
+        Parameters
+        ----------
+        values : (n, features) float32
+
+        Returns
+        -------
+        start : (classes,) float64
+            Mean shares of the roots.
+        added : (n, features, classes) float64
+            `start` plus the sum over the features are the probabilities.
+        """
+        counts = np.zeros((len(self.feature), self.n_classes))
+        counts[self.feature < 0] = self.leaf_counts
+        nodes = self._nodes  # type: ignore[attr-defined]
+        sum_leaves(self.tree_sizes, nodes, counts)
+        shares = counts / counts.sum(axis=1, keepdims=True)
+        added = np.zeros((len(values), self.n_features, self.n_classes))
+        add_along_paths(np.asarray(values, np.float32), self.tree_sizes, nodes, shares, added)
+        roots = np.cumsum(self.tree_sizes) - self.tree_sizes
+        return shares[roots].mean(axis=0), added / self.n_trees
+
+
+@njit
+def sum_leaves(sizes, nodes, counts):
+    """Set the counts (nodes, classes) of inner nodes to the sums of their leaves."""
+    end = len(nodes)
+    for t in range(len(sizes) - 1, -1, -1):
+        start = end - sizes[t]
+        for node in range(end - 1, start - 1, -1):
+            left = start + nodes[node].left
+            if left != node:
+                counts[node] = counts[left] + counts[left + 1]
+        end = start
+
+
+@njit
+def add_along_paths(values, sizes, nodes, shares, added):
+    """Add the changes of the shares (nodes, classes) of each split to `added`, for rows."""
+    start = 0
+    for t in range(len(sizes)):
+        for row in range(len(values)):
+            at = start
+            while start + nodes[at].left != at:
+                node = nodes[at]
+                right = np.uint32(values[row, node.feature] > node.threshold)
+                to = start + node.left + right
+                added[row, node.feature] += shares[to] - shares[at]
+                at = to
+        start += sizes[t]
+
 
 @njit
 def walk(values, sizes, nodes, shares, out):

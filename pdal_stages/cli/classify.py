@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,13 @@ def add_commands(parser: Parser) -> None:
     add = parser.command("classify", _classify, help, overrides=True, progress=True, rare=rare)
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     add("output", help="A file, a folder, or a name with # for the input's")
+    add_request_options(add)
+    add("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
+    add_tile_options(parser.commands["classify"], survey=True)
+
+
+def add_request_options(add: Callable) -> None:
+    """Add the options that tell how points are classified."""
     add("--model", default="standard", help="A model file or a shipped model (default: standard)")
     ground = (
         "given: points of the classes 2, 9 and 11 (ground, water, road) are the ground, and keep "
@@ -61,11 +69,9 @@ def add_commands(parser: Parser) -> None:
     add("--polygons", action="append", default=[], metavar="FILE=CODE", help=polygons)
     add_stage_options(add, "filters.modelclassifier", *_CLASSIFIER_OPTIONS)
     add("--where", help="Classify only points that meet this condition")
-    add("--metadata", metavar="FILE", help="Write the metadata of the run to a JSON file")
-    add_tile_options(parser.commands["classify"], survey=True)
 
 
-def _request(options: argparse.Namespace) -> ClassifyRequest:
+def request_of(options: argparse.Namespace) -> ClassifyRequest:
     """Return how points are to be classified."""
     from ..pipeline.classify_request import WRITTEN, ClassifyRequest
 
@@ -93,7 +99,7 @@ def _classify(options: argparse.Namespace) -> int:
     task = ClassifyTask(
         tuple(options.inputs),
         options.output,
-        _request(options),
+        request_of(options),
         tiling_options(options),
         tuple(files),
     )

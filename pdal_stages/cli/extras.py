@@ -1,10 +1,15 @@
-"""Commands that are extras: objects, review and corrections of classified files, and the demo."""
+"""Commands that are extras: objects, review, reasons and corrections of files, and the demo."""
 
 from __future__ import annotations
 
 import argparse
+import json
+from dataclasses import asdict
 
+from ..base.files import JSON, Output, check_outputs, write_json
 from ..base.messages import one_line
+from ..base.version import __version__
+from .classify import add_request_options, request_of
 from .parser import Parser, add_stage_options, stage_options
 
 #: Options of ``writers.objects`` that ``objects`` has flags for.
@@ -15,7 +20,7 @@ _WORKERS = "Files to read at the same time (default: 1)"
 
 
 def add_commands(parser: Parser) -> None:
-    """Add ``objects``, ``review``, ``corrections`` and ``demo``."""
+    """Add ``objects``, ``review``, ``explain``, ``corrections`` and ``demo``."""
     what = "Write buildings, trees, wires and bridge decks to a vector file"
     add = parser.command("objects", _objects, what, overrides=True, progress=True)
     add("inputs", nargs="+", metavar="input", help=_INPUTS)
@@ -34,6 +39,17 @@ def add_commands(parser: Parser) -> None:
     add("--cell", type=float, default=0.0, metavar="METERS", help=cell)
     add("--workers", type=int, default=1, metavar="N", help=_WORKERS)
     add("--model", default="standard", help="Model for files without Reliability (standard)")
+
+    what = "Tell why points have their class: ground filter, inputs of the model, what came after"
+    rare = ("ground", "dimensions")
+    add = parser.command("explain", _explain, what, overrides=True, rare=rare)
+    add("cloud", help="LAS or LAZ file, folder or pattern, classified or not")
+    add("place", nargs="*", type=float, metavar="X Y [Z]", help="The nearest point is explained")
+    points = "CSV file of x, y and, where known, z; or vector file of points"
+    add("--points", metavar="FILE", default="", help=points)
+    add("--crs", default="", help="Reference system of X and Y (default: the cloud's)")
+    add("--json", metavar="FILE", default="", help="Write JSON, too; - prints it instead of text")
+    add_request_options(add)
 
     what = "Mark points that a person corrected or confirmed, to train on"
     add = parser.command("corrections", _corrections, what)
@@ -78,6 +94,24 @@ def _review(options: argparse.Namespace) -> None:
     print("\n".join(lines(review.to_dict())))
     names = [name for name in (options.output, options.json) if name]
     print(one_line(f"written to {', '.join(names)}"))
+
+
+def _explain(options: argparse.Namespace) -> None:
+    """Explain points."""
+    from ..review.explain import explain_points
+    from ..review.explanation_text import lines
+    from ..review.places import read_places
+
+    places = read_places(options.cloud, options.place, options.points, options.crs)
+    output = [Output(options.json, "json", JSON)] if options.json not in ("", "-") else []
+    check_outputs(output, [options.cloud, *filter(None, [options.points])])
+    explained = explain_points([options.cloud], places, request_of(options))
+    if options.json != "-":
+        print("\n\n".join("\n".join(lines(each)) for each in explained))
+    if options.json:
+        values = {"version": __version__, "points": [asdict(each) for each in explained]}
+        text = json.dumps(values, indent=1)
+        print(text) if options.json == "-" else write_json(options.json, values, "json")
 
 
 def _corrections(options: argparse.Namespace) -> None:

@@ -21,7 +21,7 @@ COMMANDS = {
     "pipelines": ("pipeline", "expand", "validate"),
     "installation": ("drivers", "options", "doctor", "plugin", "warmup"),
     "deliverables": ("surfaces", "report"),
-    "extras": ("objects", "review", "corrections", "demo"),
+    "extras": ("objects", "review", "explain", "corrections", "demo"),
 }
 OVERRIDES = "Stages take options as in PDAL: --stage.TAG.option=V, --filters.name.option=V"
 INPUTS = "Files, folders, patterns, tile indexes"

@@ -31,6 +31,7 @@ from ..base.json_types import StageJson
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, is_too_flat, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
+from ..classifier.interface import Observe
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import UNCLASSIFIED, PointRoles, Prediction, PredictionOptions
@@ -232,11 +233,11 @@ class ApplyModel(Stage, settings=PredictionOptions):
         unsure = UNCLASSIFIED if self.keep_sure is not None else None
         return unsure if self.rejected_code is None else self.rejected_code
 
-    @property
-    def _prediction(self) -> PredictionOptions:
+    def _prediction(self, observe: Observe | None) -> PredictionOptions:
         """Return the options of classifying a cloud."""
-        values = {field.name: getattr(self, field.name) for field in fields(PredictionOptions)}
-        return PredictionOptions(**{**values, "rejected_code": self._rejected})
+        names = [field.name for field in fields(PredictionOptions) if field.name != "observe"]
+        values = {**{name: getattr(self, name) for name in names}, "rejected_code": self._rejected}
+        return PredictionOptions(**values, observe=observe)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Classify the points."""
@@ -264,9 +265,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
         points.keep_only([*dimensions, *self.creates(), _HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             roles = PointRoles.check(points.count, wanted, ignored, current, ground)
-            prediction = self.model.classify(
-                points.take_xyz(), dimensions, roles, self._prediction, progress
-            )
+            how = self._prediction(context.observer and context.observer.observe)
+            prediction = self.model.classify(points.take_xyz(), dimensions, roles, how, progress)
         rejected = np.zeros(points.count, np.bool_)
         rejected[prediction.unsure] = True
         codes = prediction.classification

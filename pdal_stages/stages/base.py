@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -17,6 +17,8 @@ from ..base.files import Output, check_writable
 from ..base.json_types import JsonObject, StageJson
 from ..base.options import Option, decode_options, option, option_of, parse_options
 from ..base.units import named_unit
+from ..classifier.interface import Observe
+from ..terrain.filter_options import Keep
 from .options import Selection, ignore_option
 from .points import Points
 from .where_expression import Expression
@@ -33,6 +35,15 @@ def files_read(stages: Sequence[StageJson]) -> list[str]:
     """Return the files of the readers among stages, as they are written."""
     readers = [stage for stage in stages if str(stage.get("type")).startswith("readers.")]
     return [str(stage["filename"]) for stage in readers if "filename" in stage]
+
+
+class Observer(NamedTuple):
+    """Functions that receive how stages come to their results."""
+
+    keep: Keep  #: what each step of the ground filter made
+    #: the columns (n,) of :func:`..terrain.heights.filtered_ground` by name
+    columns: Callable[[Mapping[str, NDArray]], None]
+    observe: Observe  #: what each pass of a model read of the points to classify
 
 
 @dataclass(frozen=True)
@@ -54,6 +65,8 @@ class StageContext:
     #: In a tile: the blocks that an earlier round left for a stage that reaches far
     #: (:class:`FarReaching`).
     blocks: Sequence[Mapping[str, NDArray]] | None = None
+    #: Receives how stages come to their results.
+    observer: Observer | None = None
 
     def used(self, arrays: Mapping[str, NDArray]) -> NDArray[np.bool_] | None:
         """Return which points (n,) have results that are used; None outside tiles: all."""

@@ -145,17 +145,21 @@ class HagMorphological(FarReaching, settings=FilterOptions):
                 found=f"{points.count:,} points",
                 cure="Classify the ground first, or leave 'given_ground' out: ground is then found",
             )
+        watched = context.observer
+        keep = self._write_rasters(points) if watched is None else watched.keep
         columns = filtered_ground(
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
-            **{**vars(self._filter), "keep": self._write_rasters(points)},
+            **{**vars(self._filter), "keep": keep, "judged": watched is not None},
             cells=None if context.blocks is None else GroundCells(context.blocks),
             figures=points.report.figures,
             ground=ground if ground is None or all_wanted else ground[wanted],
         )
+        if watched is not None:
+            watched.columns(columns)
         out = {}
         for name in self.creates():
-            values = columns.pop(name)
+            values = columns[name] if watched is not None else columns.pop(name)
             if is_height(name) and points.units.vertical != 1.0:
                 values = values / points.units.vertical
             # As PDAL will have it; a copy more of each would be the most that this stage holds.

@@ -63,6 +63,8 @@ class FilterOptions(Settings):
         may_be_empty=True,
     )
     slope_too: bool = False  #: whether the terrain's slope is wanted
+    #: whether heights above the provisional surface, and what is still ground, are wanted
+    judged: bool = False
     keep: Keep | None = None  #: receives what each step made of each piece of the cloud
     threads: int | None = None  #: None or 0: every available core
 
@@ -109,4 +111,8 @@ class FilterOptions(Settings):
         gradient: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
         """Return which points to `use` are ground by their height and slope; NaN is not."""
-        return use & (np.abs(height) <= self.threshold + self.scalar * gradient)
+        return use & (np.abs(height) <= self.tolerance(gradient))
+
+    def tolerance(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far from the provisional surface points are ground, in meters."""
+        return self.threshold + self.scalar * gradient

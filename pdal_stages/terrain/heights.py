@@ -58,6 +58,8 @@ from .surface import GroundRaster, GroundSurface, LevelSurface, heights_above
 #: some 90 bytes a cell. Surroundings of squares would cost 2.3 times the work. Not tuned.
 MAX_CELLS_PER_POINT = 2.5
 MAX_CELLS = 50_000_000
+#: Columns of `judged` points.
+JUDGED = ("HeightAboveProvisional", "GroundTolerance")
 
 
 class _Piece(NamedTuple):
@@ -104,7 +106,8 @@ def filtered_ground(
     -------
     dict of str to ndarray, shape (n,)
         ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 for ground), ``Slope`` (float64,
-        degrees), ``HeightAboveOpening_<window>`` (float32). NaN where a coordinate is not finite.
+        degrees), ``HeightAboveOpening_<window>`` (float32), and, where they are wanted, those of
+        :data:`JUDGED`. NaN where a coordinate is not finite.
 
     Raises
     ------
@@ -162,6 +165,7 @@ def _heights(
         "HeightAboveGround": np.zeros(count),
         "Ground": np.zeros(count, np.uint8),
         **({"Slope": np.zeros(count)} if options.slope_too else {}),
+        **{name: np.zeros(count) for name in JUDGED * options.judged},
         **{opening(width).name: np.zeros(count, np.float32) for width in options.openings},
     }
     for rows, core, part, raster in pieces if count else ():
@@ -266,6 +270,8 @@ def _measure(
     }
     if options.slope_too:
         out["Slope"] = np.degrees(np.arctan(gradient))
+    if raster.judged is not None:
+        out |= zip(JUDGED, raster.judged, strict=True)
     for width, radius in zip(options.openings, options.requested_radii, strict=True):
         values, _ = above(LevelSurface(raster.window, raster.opened[radius]))
         out[opening(width).name] = np.where(np.isnan(values), height, values).astype(np.float32)

@@ -240,6 +240,8 @@ def _judge(
     x, y, z, _, _, row = points
     above = heights_above(x, y, z, row, raster.surface, options.cell, options.threads)
     is_ground = options.is_ground(points.use, *above)
+    if options.judged:
+        raster = replace(raster, judged=np.stack([above[0], options.tolerance(above[1])]))
     if given:
         return replace(raster, is_ground=is_ground, surface=None)
     held, place = means or ground_means([(points, is_ground)], options.cell, raster.window)

@@ -95,6 +95,9 @@ class GroundRaster:
     is_ground: NDArray[np.bool_] | None = (
         None  #: (n,) which points are ground, once they are judged
     )
+    #: (2, n) heights of points above the provisional surface, and how high they may be as ground;
+    #: where they are wanted
+    judged: NDArray[np.float64] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -1,0 +1,71 @@
+"""Explain the classes of points: what each stage made of them, and which inputs decided."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..base.errors import OptionError
+from ..pipeline.classify_request import ClassifyRequest
+from ..pipeline.inputs_outputs import input_files, is_las
+from ..pipeline.spatial_reference import check_one_reference, reference_of_file
+from .explanation import AskedPlace, Explanation
+from .recording import Recording, Surroundings
+from .trace_points import trace_point
+
+#: Side in meters of squares whose points are explained in one run (not tuned).
+_SQUARE_M = 256.0
+
+
+def explain_points(
+    inputs: Sequence[str], places: Sequence[AskedPlace], request: ClassifyRequest
+) -> list[Explanation]:
+    """Explain the points nearest to places.
+
+    Parameters
+    ----------
+    inputs : sequence of str
+        LAS and LAZ files, folders or patterns.
+    places : sequence of AskedPlace
+        In the reference system of the files.
+    request : ClassifyRequest
+        How the points are classified.
+
+    Raises
+    ------
+    StageError
+        Where no point is near a place, or the points cannot be classified.
+    """
+    files = input_files(inputs)
+    if odd := [name for name in files if not is_las(name)]:
+        cure = "Convert it first: pdal translate INPUT input.laz"
+        raise OptionError("explain reads LAS and LAZ files", found=odd[0], cure=cure)
+    references = {path: reference_of_file(path) for path in files}
+    check_one_reference(references)
+    reference = references[files[0]]
+    exact = {**request.classifier_options, "compact": False}
+    request = replace(request, dimensions=("Probability_",), classifier_options=exact)
+    unit = reference.units.horizontal
+    squares: dict[tuple[int, int], list[int]] = {}
+    for number, place in enumerate(places):
+        key = int(place.x * unit // _SQUARE_M), int(place.y * unit // _SQUARE_M)
+        squares.setdefault(key, []).append(number)
+    out: dict[int, Explanation] = {}
+    for members in squares.values():
+        pipeline = request.pipeline(files[0], "explained.laz")
+        if not pipeline.is_read_here:
+            types = ", ".join(stage["type"] for stage in request.stages)
+            what = "the model's heights are those of stages of PDAL, which explain does not run"
+            raise OptionError(what, found=types, cure="Take another model")
+        reach = sum(ours.stage.halo_m() for ours in pipeline.expanded.ours) / unit
+        xy = np.array([places[number][:2] for number in members])
+        around = Surroundings(files, [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)])
+        found = [around.nearest(places[number], unit) for number in members]
+        rows = np.array([row for row, _ in found])
+        recording = Recording(around, request, reference, rows)
+        recording.run(pipeline)
+        for at, number in enumerate(members):
+            out[number] = trace_point(recording, at, found[at][1])
+    return [out[number] for number in range(len(places))]

@@ -1,0 +1,113 @@
+"""What is told of a point: where it is, what each stage made of it, and which inputs decided."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+
+class AskedPlace(NamedTuple):
+    """Where a point is looked for, in the coordinates of the cloud."""
+
+    x: float
+    y: float
+    z: float | None = None
+
+
+@dataclass(frozen=True)
+class FoundPoint:
+    """The point that is explained."""
+
+    file: str
+    number: int  #: in the file, from 0
+    x: float
+    y: float
+    z: float
+    distance_m: float  #: from the place that was asked for
+    return_number: int
+    number_of_returns: int
+    checked: bool  #: a person has checked its class (``corrections``)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Whether a point is noise, and why."""
+
+    code: int  #: 7, 18 or 0
+    state: int  #: of :mod:`..terrain.detached`
+
+
+@dataclass(frozen=True)
+class GroundSteps:
+    """What the steps of the ground filter made of a point and its cell; in meters.
+
+    Elevations of the cell are relative to the point: -4.2 is 4.2 m below it.
+    """
+
+    cell: float  #: side of the cell
+    window: float  #: width of the largest opening
+    lowest: float | None  #: point of the cell that may be ground; None: a low outlier, or none
+    floor: float | None  #: what the openings left of it
+    land: float | None  #: what the search for wide roofs left of it
+    rounds: Sequence[bool]  #: whether the cell is ground after each round that regains ground
+    given: float | None  #: mean of the given ground in the cell
+    lowest_near: float | None  #: point within 5 cells that may be ground
+    is_given: bool  #: whether heights are those above given ground
+    height: float  #: above the ground
+    above_provisional: float
+    tolerance: float  #: how far from the provisional surface points are ground
+    is_ground: bool
+    openings: Mapping[float, float]  #: heights above openings, by the width of the window
+
+
+@dataclass(frozen=True)
+class PassInput:
+    """An input of a pass, and what it added to the probabilities."""
+
+    name: str
+    value: float | None  #: None of all that is read of an earlier pass
+    added: Mapping[int, float]  #: by class
+    #: by class, the share of training samples with lower values; empty where that is not known
+    below: Mapping[int, float]
+
+
+@dataclass(frozen=True)
+class PassTrace:
+    """What a pass of the model read of a point, and its probabilities."""
+
+    probabilities: Mapping[int, float]  #: by class, before priors
+    start: Mapping[int, float]  #: before any input; empty where the learner cannot tell
+    inputs: Sequence[PassInput]  #: largest first; empty likewise
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the model said of a point."""
+
+    model: str
+    classes: Mapping[int, str]  #: names
+    probabilities: Mapping[int, float]  #: after priors
+    winner: int
+    rival: int  #: the class of the file where the model has it, else the second
+    passes: Sequence[PassTrace]  #: empty of a network
+    stands_for_it_m: float | None  #: how far away the point of its voxel is that is computed
+    limit: float | None  #: least reliability that keeps the class
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """How a point came to its class."""
+
+    point: FoundPoint
+    in_file: int  #: class
+    computed: int  #: class that the stages give now
+    kept: str  #: why it is not classified; empty where it is
+    noise: Noise | None  #: None where noise is not looked for, or the point was left out
+    ground: GroundSteps | None  #: None of other heights
+    verdict: Verdict | None  #: None where it is not classified
+    #: after the model: what each step is called, and the class after it
+    steps: Sequence[tuple[str, int]]
+    #: dimensions of the file that the stages compute, and whether they get the same
+    same: Mapping[str, bool]
+    notes: Sequence[str]

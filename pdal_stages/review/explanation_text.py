@@ -1,0 +1,225 @@
+"""Explanations as text: about a screen, for people who know lidar and not the code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..base.asprs import class_name
+from ..base.messages import one_line
+from ..terrain.detached import HELD, SOLID
+from .explanation import Explanation, GroundSteps, PassInput, PassTrace, Verdict
+from .input_words import words_for
+from .trace_points import SURROUNDINGS
+
+#: Inputs that are shown of the last pass, beside its surroundings.
+_OF_LAST = 4
+#: Inputs that are shown of the first pass.
+_OF_FIRST = 10
+#: Width of the column of names.
+_NAME = 16
+#: Width of a number.
+_NUMBER = 12
+
+
+def lines(told: Explanation) -> list[str]:
+    """Return an explanation as lines of text."""
+    point, after = told.point, told.steps
+    number = f"point {point.number:,} of {one_line(point.file)}"
+    place = f"{point.x:.2f} {point.y:.2f} {point.z:.2f}, {point.distance_m:.2f} m away"
+    return [
+        f"{number}: {place}, return {point.return_number} of {point.number_of_returns}",
+        f"{_class(told.in_file)} in the file, {_class(told.computed)} computed now",
+        *_differences(told),
+        "",
+        "WHAT BECAME OF IT",
+        _row("noise", _noise(told)),
+        *(
+            [_row("ground", "found by another stage")]
+            if told.ground is None
+            else _ground(told.ground)
+        ),
+        "",
+        "WHAT THE MODEL SAW",
+        *([_row("nothing", told.kept)] if told.verdict is None else _verdict(told.verdict)),
+        "",
+        "WHAT CAME AFTER",
+        *(_row(what, f"then {_class(code)}") for what, code in after),
+        *([] if after else [_row("nothing", "no option that changes classes after the model")]),
+        *(_row("note", note) for note in told.notes),
+    ]
+
+
+def _row(name: str, text: str) -> str:
+    return f"  {name:<{_NAME}} {text}"
+
+
+def _class(code: int) -> str:
+    return f"{code} {class_name(code)}"
+
+
+def _differences(told: Explanation) -> list[str]:
+    """Return what differs from the run that gave the file its class."""
+    heights, reliability = (told.same.get(n) for n in ("HeightAboveGround", "Reliability"))
+    if told.in_file == told.computed and heights is not False and reliability is not False:
+        return []
+    if told.point.checked:
+        return ["the file differs: a person set or confirmed the class (Checked is 1)"]
+    if heights is False:
+        texts = [
+            "the file differs from its height on (HeightAboveGround): another ground, by --ground,",
+            "edited classes 2, 9, 11, options of the ground filter, other points, or a version",
+        ]
+    elif reliability is False:
+        texts = [
+            "the file differs from its Reliability on, its height is the same: another --model,",
+            "another version of it, or noise and options of the model that are not given here",
+        ]
+    elif heights and reliability:
+        texts = [
+            "the file differs in the class alone: it was changed after the model, by hand or by an",
+            "option that is not given here (--keep-sure, --vegetation-heights, --bridges, ...)",
+        ]
+    else:
+        texts = ["the file differs; it has no HeightAboveGround and Reliability that tell where"]
+    return texts
+
+
+def _noise(told: Explanation) -> str:
+    """Return whether it is noise, and why."""
+    if told.noise is None:
+        return told.kept or "not looked for (--no-noise)"
+    if told.noise.code:
+        where = "below the ground" if told.noise.code == 7 else "in the air"
+        return f"yes, {_class(told.noise.code)}: alone or in a small cluster, {where}"
+    if told.noise.state == SOLID:
+        return "no: it belongs to something large, with points close to each other"
+    if told.noise.state == HELD:
+        return "no: it stands apart, but near something large"
+    return "no: it stands apart, but neither above what is around nor below the ground"
+
+
+# ---- the ground filter ---------------------------------------------------------------------------
+
+
+def _ground(ground: GroundSteps) -> list[str]:
+    """Return what each step of the ground filter made of its cell."""
+    name = f"its {ground.cell:g} m cell"
+    out = [_row(name, f"lowest point: {_relative(ground.lowest)}")]
+    if ground.is_given:
+        near = f"lowest point within 5 m: {_relative(ground.lowest_near)}"
+        given = f"in the cell (classes 2, 9, 11): {_relative(ground.given)}; {near}"
+        out.append(_row("--ground given", given))
+    elif ground.lowest is not None:
+        out += _cell_steps(ground, ground.lowest)
+    away = f"{abs(ground.above_provisional):.2f} m from the surface through ground cells"
+    judged = f"{ground.tolerance:.2f} m allowed: {'' if ground.is_ground else 'not '}ground"
+    height = f"{ground.height:.2f} m above ground"
+    if ground.openings:
+        each = (f"{high:.2f} m ({width:g} m window)" for width, high in ground.openings.items())
+        height += f"; above what an opening leaves: {', '.join(each)}"
+    return [*out, _row("ground or not", f"{away}, {judged}"), _row("height", height)]
+
+
+def _relative(height: float | None) -> str:
+    if height is None:
+        return "none"
+    return f"{abs(height):.2f} m {'below' if height <= 0 else 'above'} this point"
+
+
+def _cell_steps(ground: GroundSteps, lowest: float) -> list[str]:
+    """Return what openings, wide roofs and rounds made of a cell, whose lowest point is given."""
+    floor = lowest if ground.floor is None else ground.floor
+    land = floor if ground.land is None else ground.land
+    width = f"windows of up to {ground.window:g} m"
+    opened = f"{width} do not lower the cell more than a slope would: ground so far"
+    if floor < lowest:
+        opened = f"{width} lower the cell by {lowest - floor:.2f} m: an object"
+    out = [_row("openings", opened)]
+    if land < floor:
+        roof = f"a roof wider than the windows, {floor - land:.2f} m above the land: an object"
+        out.append(_row("wide roof", roof))
+    if land >= lowest:
+        return out
+    first = next((n for n, ground_now in enumerate(ground.rounds, 1) if ground_now), 0)
+    regained = f"in round {first}: ground, as it continues the ground around"
+    return [*out, _row("regained", regained if first else "no: not among ground, nor near to it")]
+
+
+# ---- the model -----------------------------------------------------------------------------------
+
+
+def _verdict(verdict: Verdict) -> list[str]:
+    """Return the probabilities of each pass, and the inputs that decided."""
+    codes, passes = list(verdict.classes), verdict.passes
+    names = {code: _short(code) for code in codes}
+    out = [
+        _row(
+            f"{one_line(verdict.model)}"[-_NAME:],
+            "".join(f"{n:>{_NUMBER}}" for n in names.values()),
+        )
+    ]
+    shares = {f"pass {n}": each.probabilities for n, each in enumerate(passes, 1)}
+    for name, share in {**shares, "in the end": verdict.probabilities}.items():
+        out.append(_row(name, "".join(f"{share.get(code, 0.0):>{_NUMBER}.2f}" for code in codes)))
+    if verdict.stands_for_it_m is not None:
+        stands = f"a point {verdict.stands_for_it_m:.2f} m away stands for it: its inputs are shown"
+        out.append(_row("its voxel", stands))
+    if not passes or not passes[0].start:
+        return [*out, _row("reasons", "a network, or another learner than a forest, gives none")]
+    pair = verdict.winner, verdict.rival
+    ranges = any(each.below for single in passes for each in single.inputs)
+    first, second = (class_name(code) for code in pair)
+    about = "and the share of the training's points of either class with lower values."
+    if not ranges:
+        about = "(The model file has no percentiles of its training to compare it with.)"
+    titles = [*map(_short, pair), "value", *(map(_short, pair) if ranges else ())]
+    out += [
+        "",
+        f"  For {first}, against {second}: what inputs add to their probabilities, the value,",
+        f"  {about}",
+        "  " + "".join(f"{title:>{_NUMBER}}" for title in titles),
+    ]
+    for number in dict.fromkeys((len(passes), 1)):
+        count = _OF_LAST if number > 1 else _OF_FIRST
+        out += _rows(number, passes[number - 1], pair, count, ranges)
+    return out
+
+
+def _short(code: int) -> str:
+    """Return a class's name, or the last word of a long one."""
+    name = class_name(code).split(" - ")[0]
+    return name if len(name) < _NUMBER else name.split()[-1].capitalize()[: _NUMBER - 1]
+
+
+def _rows(
+    number: int, single: PassTrace, pair: tuple[int, int], count: int, ranges: bool
+) -> list[str]:
+    """Return rows for the inputs of a pass that tell two classes apart most."""
+
+    def weight(each: PassInput) -> float:
+        return each.added.get(pair[0], 0.0) - each.added.get(pair[1], 0.0)
+
+    ranked = sorted(single.inputs, key=lambda each: -abs(weight(each)))
+    chosen = [each for each in ranked if each.name != SURROUNDINGS][:count]
+    chosen += [each for each in ranked if each.name == SURROUNDINGS]
+    rest = [sum(e.added.get(c, 0.0) for e in ranked if e not in chosen) for c in pair]
+    shares = [f"{single.start.get(code, 0.0):.3f}" for code in pair]
+    out = [_columns(shares, ranges, f"pass {number} before any input")]
+    for each in sorted(chosen, key=lambda each: -weight(each)):
+        words, unit = words_for(each.name)
+        added = [f"{each.added.get(code, 0.0):+.3f}" for code in pair]
+        if each.value is None:
+            out.append(
+                _columns(added, ranges, f"surroundings: pass {number - 1}, of it and around")
+            )
+            continue
+        value = f"{each.value if abs(each.value) > 5e-4 else 0.0:.3g} {unit}".rstrip()
+        below = [f"{100 * each.below[c]:.0f} %" if c in each.below else "" for c in pair]
+        out.append(_columns([*added, value, *(below if ranges else ())], ranges, words))
+    return [*out, _columns([f"{value:+.3f}" for value in rest], ranges, "all others")]
+
+
+def _columns(values: Sequence[str], ranges: bool, words: str) -> str:
+    """Return a row of numbers, and what they are."""
+    padded = [*values, *[""] * ((5 if ranges else 3) - len(values))]
+    return "  " + "".join(f"{value:>{_NUMBER}}" for value in padded) + f"  {words}"

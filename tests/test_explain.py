@@ -1,0 +1,231 @@
+"""`explain`: it computes what `classify` wrote, its sums add up, and its text names planted errors."""
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+
+from pdal_stages.base.asprs import class_name
+from pdal_stages.classifier.training_percentiles import PERCENTILES
+from pdal_stages.cli import main
+from pdal_stages.review.trace_points import SURROUNDINGS, share_below
+
+pytestmark = pytest.mark.pdal
+DATA = "tests/data/city.laz"
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory, request):
+    """A part of a city, classified by the shipped model."""
+    folder = tmp_path_factory.mktemp("city")
+    las = laspy.read(request.config.rootpath / DATA)
+    las.points = las.points[(las.x < 770625) & (las.y < 6277530)]
+    las.write(folder / "raw.laz")
+    assert main(["classify", str(folder / "raw.laz"), str(folder / "city.laz")]) == 0
+    return folder / "city.laz"
+
+
+@pytest.fixture()
+def explain(run, tmp_path):
+    """Return a function that gives the text and the JSON of an explanation."""
+
+    def go(*words):
+        target = tmp_path / "told.json"
+        code, out, err = run("explain", *words, "--json", target)
+        assert code == 0, err
+        return out, json.loads(target.read_text())["points"]
+
+    return go
+
+
+def places_of(path, rows):
+    las = laspy.read(path)
+    return las, np.stack([las.x, las.y, las.z], axis=1)[rows]
+
+
+def csv_of(path, places):
+    path.write_text("x,y,z\n" + "\n".join(",".join(map(str, place)) for place in places))
+    return path
+
+
+def test_it_computes_what_classify_wrote_and_sums_add_up(city, explain, tmp_path):
+    rows = np.random.default_rng(0).choice(len(laspy.read(city)), 30, replace=False)
+    las, places = places_of(city, rows)
+    _, told = explain(city, "--points", csv_of(tmp_path / "p.csv", places))
+    for row, each in zip(rows, told, strict=True):
+        assert each["point"]["number"] == row and each["point"]["distance_m"] < 1e-6
+        assert each["computed"] == each["in_file"] == las.classification[row]
+        assert all(each["same"].values()) and len(each["same"]) == 2
+        if each["verdict"] is None:
+            continue
+        winner = str(each["verdict"]["winner"])
+        reliability = each["verdict"]["probabilities"][winner]
+        assert reliability == pytest.approx(las.Reliability[row], abs=1 / 128 + 1e-6)
+        for single in each["verdict"]["passes"]:
+            for code, share in single["probabilities"].items():
+                added = sum(entry["added"][code] for entry in single["inputs"])
+                assert single["start"][code] + added == pytest.approx(share, abs=1e-6)
+        heights = next(
+            entry["value"]
+            for entry in each["verdict"]["passes"][0]["inputs"]
+            if entry["name"] == "HeightAboveGround"
+        )
+        if each["verdict"]["stands_for_it_m"] is None:
+            assert heights == pytest.approx(each["ground"]["height"], abs=1e-4)
+        assert each["verdict"]["passes"][-1]["inputs"][-1]["name"] == SURROUNDINGS
+
+
+def test_the_ground_filter_is_told_step_by_step(city, explain, tmp_path):
+    las, _ = places_of(city, [])
+    ground, roof = (np.flatnonzero(las.classification == code)[[7, -7]] for code in (2, 6))
+    for rows, is_ground in ((ground, True), (roof, False)):
+        _, places = places_of(city, rows)
+        _, told = explain(city, "--points", csv_of(tmp_path / "p.csv", places))
+        for each in told:
+            steps = each["ground"]
+            assert steps["is_ground"] == is_ground
+            assert (abs(steps["above_provisional"]) <= steps["tolerance"]) == is_ground
+            assert any(steps["rounds"]) == is_ground and (steps["floor"] < -1.0) != is_ground
+            assert steps["lowest"] <= 1e-3 and steps["cell"] == 1.0 and not steps["is_given"]
+
+
+def test_text_is_a_screen_and_names_what_the_model_saw(city, explain):
+    _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 6)[:1])
+    text, (each,) = explain(city, *places[0])
+    rows = text.splitlines()
+    assert len(rows) <= 50 and max(map(len, rows[1:])) <= 120
+    pair = [class_name(each["verdict"][name]) for name in ("winner", "rival")]
+    assert f"For {pair[0]}, against {pair[1]}" in text and "pass 2 before any input" in text
+    assert "6 Building in the file, 6 Building computed now" in text
+    assert "the file differs" not in text and "surroundings: pass 1" in text
+
+
+# ---- planted errors ------------------------------------------------------------------------------
+
+
+def test_a_class_changed_by_hand_or_by_an_option_after_the_model(city, explain, tmp_path):
+    las, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 5)[:1])
+    las.classification[np.flatnonzero(las.classification == 5)[:1]] = 6
+    las.write(tmp_path / "edited.laz")
+    text, (each,) = explain(tmp_path / "edited.laz", *places[0])
+    assert each["in_file"] == 6 and each["computed"] == 5 and each["verdict"]["rival"] == 6
+    assert "the file differs in the class alone" in text
+
+
+def test_another_model_or_another_ground(city, explain, tmp_path):
+    las, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 5)[:1])
+    row = np.flatnonzero(las.classification == 5)[0]
+    las.classification[row], las.Reliability[row] = 6, las.Reliability[row] / 2
+    las.write(tmp_path / "other.laz")
+    assert "from its Reliability on" in explain(tmp_path / "other.laz", *places[0])[0]
+    las.HeightAboveGround[row] -= 2.0
+    las.write(tmp_path / "ground.laz")
+    assert "from its height on" in explain(tmp_path / "ground.laz", *places[0])[0]
+
+
+def test_given_ground_that_was_edited_is_seen_beside_the_lowest_point(city, explain, tmp_path):
+    """Ground that someone set on top of a roof or hedge lies above the lowest points around."""
+    las = laspy.read(city)
+    row = np.flatnonzero(las.classification == 6)[3]
+    x, y, codes = (np.array(values) for values in (las.x, las.y, las.classification))
+    edited = (np.hypot(x - x[row], y - y[row]) < 3.0) & (codes == 6)
+    las.classification = np.where(edited, 2, codes)
+    las.write(tmp_path / "edited.laz")
+    _, places = places_of(tmp_path / "edited.laz", [row])
+    text, (each,) = explain(tmp_path / "edited.laz", *places[0], "--ground", "given")
+    assert each["kept"] and "given ground, which keeps its class" in text
+    assert each["ground"]["given"] > each["ground"]["lowest_near"] + 1.0
+    assert "in the cell (classes 2, 9, 11)" in text
+
+
+def test_options_after_the_model_and_stages_are_told(city, explain, tmp_path):
+    _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 5)[:1])
+    words = ["--vegetation-heights", "20,30", "--keep-sure", "0.9", "--bridges"]
+    text, (each,) = explain(city, *places[0], *words)
+    assert each["computed"] == 3 and [step[1] for step in each["steps"]] == [5, 3, 3]
+    assert "then 3 Low vegetation" in text and "filters.bridges" in text
+
+
+def test_noise_where_and_what_is_left_out(city, explain, tmp_path):
+    las = laspy.read(city)
+    row = int(np.argmax(las.z))
+    las.z[row] += 0.0
+    las.Z[row] += round(60.0 / las.header.scales[2])
+    las.write(tmp_path / "bird.laz")
+    _, places = places_of(tmp_path / "bird.laz", [row])
+    text, (each,) = explain(tmp_path / "bird.laz", *places[0])
+    assert each["noise"]["code"] == each["computed"] == 18 and "yes, 18 High noise" in text
+    assert each["kept"] == "class 18 is left out" and each["verdict"] is None
+    text, (each,) = explain(city, *places[0][:2], "--where", "Z > 1000")
+    assert "outside --where Z > 1000" in text and each["computed"] == each["in_file"]
+
+
+# ---- files and places ----------------------------------------------------------------------------
+
+
+def test_at_a_seam_of_a_survey_the_neighbors_count(city, explain, tmp_path):
+    las = laspy.read(city)
+    middle = float(np.median(las.x))
+    (tmp_path / "survey").mkdir()
+    for name, part in (("west", las.x < middle), ("east", las.x >= middle)):
+        half = laspy.LasData(las.header)
+        half.points = las.points[part]
+        half.write(tmp_path / "survey" / f"{name}.laz")
+    row = int(np.argmin(np.abs(las.x - middle)))
+    _, places = places_of(city, [row])
+    _, (whole,) = explain(city, *places[0])
+    _, (cut,) = explain(tmp_path / "survey", *places[0])
+    assert {**whole, "point": 0} == {**cut, "point": 0}
+
+
+def test_places_of_vector_files_and_other_reference_systems(city, explain, tmp_path):
+    pyogrio, pyproj = pytest.importorskip("pyogrio"), pytest.importorskip("pyproj")
+    shapely = pytest.importorskip("shapely")
+    las, places = places_of(city, [100])
+    las.header.add_crs(pyproj.CRS(2154))
+    las.write(tmp_path / "c.laz")
+    forward = pyproj.Transformer.from_crs(2154, 4326, always_xy=True)
+    lon, lat = forward.transform(*places[0][:2])
+    _, (first,) = explain(tmp_path / "c.laz", lon, lat, "--crs", "EPSG:4326")
+    pyogrio.raw.write(
+        tmp_path / "p.gpkg",
+        np.array([shapely.to_wkb(shapely.Point(lon, lat))]),
+        [],
+        [],
+        geometry_type="Point",
+        crs="EPSG:4326",
+    )
+    _, (second,) = explain(tmp_path / "c.laz", "--points", tmp_path / "p.gpkg")
+    assert first == second and first["point"]["distance_m"] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["0", "0"], "there is no point near this place"),
+        (["770610"], "a place is X Y or X Y Z"),
+        ([], "a place is X Y or X Y Z"),
+        (["770610", "6277510", "--model", "none"], "there is no such model file"),
+        (["770610", "6277510", "90"], "the nearest is"),
+        (["1", "2", "--crs", "EPSG:4326"], "the cloud has no reference system"),
+    ],
+)
+def test_errors(city, run, words, text):
+    code, out, err = run("explain", city, *words)
+    assert code == 1 and text in err and not out
+
+
+def test_a_cloud_without_given_ground(city, run, tmp_path):
+    las = laspy.read(city)
+    las.classification[:] = 1
+    las.write(tmp_path / "none.laz")
+    code, _, err = run("explain", tmp_path / "none.laz", 770610, 6277510, "--ground", "given")
+    assert code == 1 and "no ground is given" in err
+
+
+def test_shares_below_are_those_of_the_percentiles():
+    row = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert [share_below(v, row) for v in row] == [p / 100 for p in PERCENTILES]
+    assert share_below(1.5, row) == pytest.approx(0.15) and share_below(9.0, row) == 0.995
+    assert share_below(0.0, [0.0] * 7) == 0.5 and share_below(1.0, [0.0] * 6 + [1.0]) == 0.99
