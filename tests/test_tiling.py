@@ -483,3 +483,34 @@ def test_odd_headers_are_said_of_the_inputs_alone(tmp_path, town_file):
             and messages_text[0].startswith(f"{tmp_path}/odd0.laz: ")
         )
         assert more in messages_text[0]
+
+
+@pytest.mark.parametrize(
+    ("described", "options"),
+    [(False, {}), (True, {"ignore_vlr": "LASF_Spec/4"}), (True, {})],
+    ids=["undescribed", "ignored", "described"],
+)
+def test_extra_bytes_are_named_as_the_reader_says(
+    tmp_path, random_cloud, write_las, described, options
+):
+    """PDAL's way whole: their record counts before the reader's names, unless it is left out."""
+    x, y, z = random_cloud(3_000, seed=5, extent=(40, 40, 3)).T
+    wave = np.arange(len(x), dtype=np.uint16)
+    cloud = tmp_path / "cloud.las"
+    write_las(cloud, {"X": x, "Y": y, "Z": z, "amp": wave}, point_format=6)
+    if not described:
+        cloud.write_bytes(cloud.read_bytes().replace(b"LASF_Spec", b"LASF_Gone"))
+    reader = {"type": "readers.las", "filename": str(cloud), "extra_dims": "wave=uint16", **options}
+    name = "amp" if described and not options else "wave"
+    filters = [
+        {"type": "filters.hag_minima", "cell": 3, "where": f"{name} < 2000"},
+        {"type": "filters.assign", "value": f"UserData = 7 WHERE {name} > 2900"},
+    ]
+    (whole,) = ps.run_pipeline([reader, *filters]).arrays
+    writer = {"type": "writers.las", "filename": str(tmp_path / "o.las"), "extra_dims": "all"}
+    assert not run_tiled([reader, *filters, writer], 15, workers=0).failures
+    got = laspy.read(tmp_path / "o.las")
+    for dimension in (name, "HeightAboveGround"):
+        assert np.array_equal(got[dimension], whole[dimension]), dimension
+    assert np.array_equal(got.user_data, whole["UserData"])
+    assert got.user_data.any()

@@ -21,9 +21,9 @@ from .errors import DimensionError, OptionError, StageError
 from .las import PROJECTION, Record, end_of_points, records
 from .las_points import (
     MOST_ENTRIES,
-    TYPES,
     Layout,
     bytes_of,
+    describe,
     entries_of,
     size_of_entry,
 )
@@ -127,19 +127,16 @@ class LasCopy:
 
     def _described(self) -> list[bytes]:
         """Return descriptions of all extra bytes of the copy."""
-        listed = [r for r in (*self._before, *self._behind) if _kind(r) == _DESCRIPTIONS]
-        with open(self.source, "rb") as source:
-            data = [_data(source, record) for record in listed]
-        entries = [entry for each in data for entry in entries_of(each)]
+        entries = entries_of(self.layout.described)
         room = self.layout.header.point_bytes - _plain_bytes(self.layout)
         missing = room - sum(map(size_of_entry, entries))
         most = MOST_ENTRIES - len(entries) - len(self.added)
         # Bytes that nobody describes: one by one, or three by three where they are many.
         while missing > 0:
             triple = missing >= 3 and missing > most
-            entries.append(_entry(f"undescribed{missing}", 21 if triple else 1))
+            entries.append(describe(f"undescribed{missing}", 21 if triple else 1))
             missing, most = missing - (3 if triple else 1), most - 1
-        entries += [_entry(n, TYPES.index(k.newbyteorder("<")) + 1) for n, k in self.added.items()]
+        entries += [describe(name, kind) for name, kind in self.added.items()]
         if len(entries) > MOST_ENTRIES:
             raise DimensionError(
                 f"a LAS file describes at most {MOST_ENTRIES} extra dimensions",
@@ -343,14 +340,6 @@ def _as_bytes(values: NDArray, kind: np.dtype) -> NDArray[np.uint8]:
 def _plain_bytes(layout: Layout) -> int:
     extra = layout.dtype["extra"].itemsize if "extra" in (layout.dtype.names or ()) else 0
     return layout.header.point_bytes - extra
-
-
-def _entry(name: str, kind: int, options: int = 0) -> bytes:
-    """Return the description of extra bytes."""
-    encoded = name.encode()
-    if len(encoded) > 32:
-        raise DimensionError("the name of a dimension is too long for LAS", found=name)
-    return struct.pack("<HBB32s156x", 0, kind, options, encoded)
 
 
 def _record(user: bytes, number: int, title: bytes, data: bytes) -> bytes:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import StageError
+from .errors import DimensionError, StageError
 from .las import POINT_BYTES, POINTWISE, LasHeader, laszip_record, read_header, records_of
 
 #: Points read at a time: 30 to 70 MB as LAS stores them.
@@ -163,23 +163,37 @@ def description(path: str | os.PathLike) -> bytes:
     )
 
 
+def describe(name: str, kind: np.dtype | int, options: int = 0) -> bytes:
+    """Return a description of extra bytes; `kind` is a type, or its number in LAS."""
+    encoded = name.encode()
+    if len(encoded) > 32:
+        raise DimensionError("the name of a dimension is too long for LAS", found=name)
+    number = kind if isinstance(kind, int) else TYPES.index(kind.newbyteorder("<")) + 1
+    return struct.pack("<HBB32s156x", 0, number, options, encoded)
+
+
 @dataclass(frozen=True)
 class Layout:
     """The layout of a file's records: where each dimension of its points stands."""
 
     header: LasHeader
     extra: tuple[ExtraField, ...] = ()
+    described: bytes = b""  #: the descriptions that `extra` comes from
 
     @classmethod
-    def of_file(cls, path: str | os.PathLike) -> Layout:
-        """Return the layout of a file; StageError where it has none."""
+    def of_file(cls, path: str | os.PathLike, described: bytes | None = None) -> Layout:
+        """Return the layout of a file; StageError where it has none.
+
+        `described` are descriptions of extra bytes (:func:`describe`) in place of the file's.
+        """
         header = read_header(path)
         if header is None:
             raise StageError("the input is not a LAS or LAZ file", where=str(path))
         if header.point_format >= len(POINT_BYTES):
             found = f"point format {header.point_format}"
             raise StageError("its point format is not known", where=str(path), found=found)
-        return cls(header, tuple(extra_fields(header, description(path))))
+        data = description(path) if described is None else described
+        return cls(header, tuple(extra_fields(header, data)), data)
 
     @cached_property
     def dtype(self) -> np.dtype:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..base.json_types import StageJson
 from ..base.las import named_copc, number_type
 from ..base.las_copy import LasCopy
-from ..base.las_points import PART, Layout, read_records
+from ..base.las_points import PART, Layout, describe, read_records
 from ..base.messages import shorten
 from ..stages.points import NO_POINT_MATCHES, SELECTED
 from ..stages.registry import stage_types
@@ -137,6 +137,42 @@ def write_copy(copy: LasCopy, target: Path, values: Mapping[str, NDArray]) -> No
 
 #: PDAL's names of types that are not NumPy's.
 FLOATS = {"float64": "double", "float32": "float"}
+
+
+def layout_read_by(reader: StageJson, path: str) -> Layout:
+    """Return the layout of a file with the names that its reader gives to extra bytes, as PDAL.
+
+    ``extra_dims`` names those that no record describes; ``ignore_vlr`` may leave that record out,
+    which in LAS 1.0 to 1.3 counts with ``use_eb_vlr`` alone.
+    """
+    layout = Layout.of_file(path)
+    named = str(reader.get("extra_dims", "")).strip()
+    is_read = layout.header.minor >= 4 or str(reader.get("use_eb_vlr", "")).lower() == "true"
+    if not named or (layout.described and is_read and _DESCRIPTIONS not in _ignored(reader)):
+        return layout
+    pairs = (part.split("=") for part in named.replace(" ", "").split(","))
+    data = b"".join(describe(name, number_type(kind)) for name, kind in pairs)
+    return Layout.of_file(path, data)
+
+
+def reader_of_copy(reader: StageJson) -> StageJson:
+    """Return a reader for copies, whose record describes all extra bytes."""
+    plain = {name: value for name, value in reader.items() if name != "extra_dims"}
+    if "ignore_vlr" in plain:
+        plain["ignore_vlr"] = ",".join(_ignored(reader) - {_DESCRIPTIONS})
+        if not plain["ignore_vlr"]:
+            del plain["ignore_vlr"]
+    return {**plain, "use_eb_vlr": True}
+
+
+_DESCRIPTIONS = "LASF_Spec/4"
+
+
+def _ignored(reader: StageJson) -> set[str]:
+    """Return the records that a reader leaves out, as ``USER/NUMBER``."""
+    listed = reader.get("ignore_vlr", ())
+    words = listed.split(",") if isinstance(listed, str) else map(str, listed)
+    return {word.strip() for word in words} - {""}
 
 
 def named_types(layout: Layout) -> dict[str, str]:

@@ -19,7 +19,9 @@ from ..base import las, las_check
 from ..base.errors import PipelineError, StageError
 from ..base.hashing import digest_of_file, fingerprint
 from ..base.json_types import JsonObject, StageJson
+from ..base.las_points import Layout
 from ..base.units import Units
+from ..pipeline.copies import layout_read_by, reader_of_copy
 from ..pipeline.inputs_outputs import LAS_READERS, locations
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of
 from .options import (
@@ -86,6 +88,16 @@ class InputSource:
     stamp: Sequence[int] = ()  #: size and time at the start of the run
     fault: str = ""  #: why it cannot be read
     index: CloudIndex | None = None  #: once it was read
+
+    @property
+    def layout(self) -> Layout:
+        """The layout of its points, as its reader names extra bytes."""
+        return layout_read_by(self.reader, self.path)
+
+    @property
+    def reader_of_copy(self) -> StageJson:
+        """The stage that reads copies of its points, without the file's name."""
+        return reader_of_copy(self.reader)
 
     @property
     def key(self) -> str:

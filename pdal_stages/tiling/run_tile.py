@@ -166,7 +166,7 @@ class _RoundRun:
     def _stages_here(self) -> list[StageJson]:
         """Return the pipeline of a round that runs without PDAL: a reader and the steps."""
         part = self.context.plan.rounds[self.number]
-        stages: list[StageJson] = [{**self.pieces[0].reader, "filename": "piece.las"}]
+        stages: list[StageJson] = [{**self.pieces[0].source.reader, "filename": "piece.las"}]
         for number in range(part.begin, part.end):
             self.steps[len(stages)] = number
             stages.append(with_threads(self.context.plan.in_tiles[number], self.context.threads))
@@ -186,8 +186,7 @@ class _RoundRun:
             copy = LasCopy(piece.source.path, piece.layout, False, added)
             with copy.writing_to(Path(path)):
                 copy.write(piece.records, origin)
-            reader = {**piece.reader, "filename": path, "tag": f"in{number}"}
-            stages.append({**reader, "use_eb_vlr": True})
+            stages.append({**piece.source.reader_of_copy, "filename": path, "tag": f"in{number}"})
         tags = [stage["tag"] for stage in stages]
         part = plan.rounds[self.number]
         # PDAL's own filters see one file at a time, until a stage merges them.

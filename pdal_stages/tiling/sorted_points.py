@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..base.files import whole_files
 from ..base.grid import begins_run
 from ..base.hashing import digest_of_file
-from ..base.json_types import JsonObject, StageJson
+from ..base.json_types import JsonObject
 from ..base.las_points import Layout, read_records
 from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource
@@ -131,11 +131,6 @@ class Piece:
         """Return the rows of the tile's own points."""
         return np.flatnonzero(self.away < 0)
 
-    @property
-    def reader(self) -> StageJson:
-        """Return the reader of its input, without a file name."""
-        return {**self.source.reader, "type": "readers.las"}
-
 
 def cut_all(
     grid: TileGrid,
@@ -151,7 +146,7 @@ def cut_all(
     pieces = []
     for source in sources:
         assert source.index is not None
-        layout = Layout.of_file(source.path)
+        layout = source.layout
         numbers, records = points_near(layout, source.index, box)
         if not len(records):
             continue

@@ -22,7 +22,7 @@ from ..base.errors import StageError
 from ..base.grid import GridWindow
 from ..base.hashing import fingerprint
 from ..base.json_types import JsonObject
-from ..base.las_points import Layout, RecordColumns
+from ..base.las_points import RecordColumns
 from ..base.messages import count_of, print_messages
 from ..base.version import build
 from .inputs import InputSource, Survey
@@ -204,7 +204,7 @@ def points_of_tile(grid: TileGrid, tile: Tile, sources: Sequence[InputSource]) -
     parts: list[Part] = []
     for source in sources:
         assert source.index is not None
-        layout = Layout.of_file(source.path)
+        layout = source.layout
         records = points_near(layout, source.index, grid.box(tile))[1]
         x, y = layout.column(records, "X"), layout.column(records, "Y")
         inside = (grid.index(x) == tile[0]) & (grid.index(y) == tile[1])

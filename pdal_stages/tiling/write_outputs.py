@@ -167,8 +167,7 @@ def run_tail(
         for number, (each, source) in enumerate(zip(sets, sources, strict=True)):
             path = Path(folder) / f"{number}.las"
             each.write(path)
-            reader = {**source.reader, "filename": str(path), "tag": f"in{number}"}
-            stages.append({**reader, "use_eb_vlr": True})
+            stages.append({**source.reader_of_copy, "filename": str(path), "tag": f"in{number}"})
             listed |= named_types(Layout.of_file(path))
         stages.append({"type": "filters.merge", "inputs": [stage["tag"] for stage in stages]})
         dimensions = ",".join(f"{name}={kind}" for name, kind in listed.items())
@@ -212,7 +211,7 @@ def write_file(
     It has class counts.
     """
     assert source.index is not None
-    count, layout = source.index.count, Layout.of_file(source.path)
+    count, layout = source.index.count, source.layout
 
     def parts() -> Iterator[tuple[NDArray, NewValues]]:
         for start in range(0, count, MOST_AT_ONCE):
