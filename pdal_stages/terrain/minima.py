@@ -22,9 +22,10 @@ from ..base.grid import cell_keys, cell_numbers, places_among
 from ..base.json_types import JsonObject
 from .cells import columns, usable
 
-#: Side of the cells whose lowest points form the terrain, and of the cells that it is
-#: interpolated to, in meters [W18 section 3.2].
-CELL_M, RESOLUTION_M = 20.0, 0.5
+#: Side in meters of the cells whose lowest points form the terrain [W18 section 3.2].
+CELL_M = 20.0
+#: Side in meters of the cells that it is interpolated to.
+RESOLUTION_M = 0.5
 
 
 def _filled(
