@@ -6,6 +6,7 @@ import json
 import shutil
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -141,6 +142,27 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
     assert np.isclose(
         json.loads((tmp_path / "w.json").read_text())["expected"], figures["expected"]
     )
+
+
+@pytest.mark.pdal
+def test_what_speaks_against_the_worst_patches_is_named(folder, tmp_path, run):
+    """Of as many patches as asked for, two inputs each, in words and in the vector file."""
+    pytest.importorskip("pyogrio")
+    out = tmp_path / "review.gpkg"
+    words = ["review", folder / "whole.laz", out, "--json", tmp_path / "r.json", "--reasons"]
+    code, output, err = run(*words, 3)
+    assert code == 0, err
+    worst = json.loads((tmp_path / "r.json").read_text())["worst"]
+    named = [row["against"] for row in worst]
+    assert all(": " in text and text.count(";") <= 1 for text in named[:3] if text)
+    assert any(named[:3]) and not any(named[3:])
+    assert output.count("against it: ") == sum(map(bool, named))
+    with closing(sqlite3.connect(out)) as base:
+        column = base.execute("SELECT against FROM patches ORDER BY fid").fetchall()
+    assert [text or "" for (text,) in column] == named[: len(column)]
+    assert "against it" not in run(*words, 0)[1]
+    code, _, err = run(*words, 3, "--model", Path(__file__).parent / "data" / "frozen-3.model")
+    assert code == 0, err
 
 
 @pytest.mark.pdal

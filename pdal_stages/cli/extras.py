@@ -38,7 +38,10 @@ def add_commands(parser: Parser) -> None:
     cell = "Side of the cells (default: by density)"
     add("--cell", type=float, default=0.0, metavar="METERS", help=cell)
     add("--workers", type=int, default=1, metavar="N", help=_WORKERS)
-    add("--model", default="standard", help="Model for files without Reliability (standard)")
+    reasons = "Name what speaks against the class of the worst N patches (10; 0: none)"
+    add("--reasons", type=int, default=10, metavar="N", help=reasons)
+    model = "Model for files without Reliability, and for --reasons (standard)"
+    add("--model", default="standard", help=model)
 
     what = "Tell why points have their class: ground filter, inputs of the model, what came after"
     rare = ("ground", "dimensions")
@@ -89,7 +92,8 @@ def _review(options: argparse.Namespace) -> None:
     """List the places to check."""
     from ..review.review_files import lines, write_review
 
-    settings = {name: getattr(options, name) for name in ("share", "cell", "model", "workers")}
+    wanted = ("share", "cell", "model", "workers", "reasons")
+    settings = {name: getattr(options, name) for name in wanted}
     review = write_review(options.inputs, options.output, options.json or "", **settings)
     print("\n".join(lines(review.to_dict())))
     names = [name for name in (options.output, options.json) if name]

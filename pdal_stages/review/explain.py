@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -20,7 +21,10 @@ _SQUARE_M = 256.0
 
 
 def explain_points(
-    inputs: Sequence[str], places: Sequence[AskedPlace], request: ClassifyRequest
+    inputs: Sequence[str],
+    places: Sequence[AskedPlace],
+    request: ClassifyRequest,
+    reach_m: float = math.inf,
 ) -> list[Explanation]:
     """Explain the points nearest to places.
 
@@ -32,6 +36,8 @@ def explain_points(
         In the reference system of the files.
     request : ClassifyRequest
         How the points are classified.
+    reach_m : float
+        Points farther away are not read, though the stages may look farther: for hints.
 
     Raises
     ------
@@ -59,9 +65,11 @@ def explain_points(
             types = ", ".join(stage["type"] for stage in request.stages)
             what = "the model's heights are those of stages of PDAL, which explain does not run"
             raise OptionError(what, found=types, cure="Take another model")
-        reach = sum(ours.stage.halo_m() for ours in pipeline.expanded.ours) / unit
+        reach_m = min(reach_m, sum(ours.stage.halo_m() for ours in pipeline.expanded.ours))
         xy = np.array([places[number][:2] for number in members])
-        around = Surroundings(files, [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)])
+        reach = reach_m / unit
+        box = [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)]
+        around = Surroundings(files, box, f"{request} {request.loaded.plan.dimensions}")
         found = [around.nearest(places[number], unit) for number in members]
         rows = np.array([row for row, _ in found])
         recording = Recording(around, request, reference, rows)

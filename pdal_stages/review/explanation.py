@@ -13,6 +13,7 @@ class AskedPlace(NamedTuple):
     x: float
     y: float
     z: float | None = None
+    doubtful_m: float = 0.0  #: the least reliable point this near is taken, if any, not the nearest
 
 
 @dataclass(frozen=True)

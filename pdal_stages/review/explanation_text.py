@@ -206,17 +206,22 @@ def _rows(
     shares = [f"{single.start.get(code, 0.0):.3f}" for code in pair]
     out = [_columns(shares, ranges, f"pass {number} before any input")]
     for each in sorted(chosen, key=lambda each: -weight(each)):
-        words, unit = words_for(each.name)
+        words, _ = words_for(each.name)
         added = [f"{each.added.get(code, 0.0):+.3f}" for code in pair]
         if each.value is None:
             out.append(
                 _columns(added, ranges, f"surroundings: pass {number - 1}, of it and around")
             )
             continue
-        value = f"{each.value if abs(each.value) > 5e-4 else 0.0:.3g} {unit}".rstrip()
         below = [f"{100 * each.below[c]:.0f} %" if c in each.below else "" for c in pair]
-        out.append(_columns([*added, value, *(below if ranges else ())], ranges, words))
+        out.append(_columns([*added, show_value(each), *(below if ranges else ())], ranges, words))
     return [*out, _columns([f"{value:+.3f}" for value in rest], ranges, "all others")]
+
+
+def show_value(each: PassInput) -> str:
+    """Return the value of an input with its unit."""
+    value = 0.0 if each.value is None or abs(each.value) < 5e-4 else each.value
+    return f"{value:.3g} {words_for(each.name)[1]}".rstrip()
 
 
 def _columns(values: Sequence[str], ranges: bool, words: str) -> str:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.grid import GridWindow
-from ..base.las_points import Layout, RecordColumns, read_records
+from ..base.las_points import USUAL, Layout, RecordColumns, SomeRows, read_records
 from ..classifier.interface import PassInputs
 from ..features.cell_means import density
 from ..pipeline.classify_request import ClassifyRequest
-from ..pipeline.copies import selection
+from ..pipeline.copies import run_stages, selection
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import ExpandedStage
 from ..pipeline.spatial_reference import Reference
@@ -29,6 +29,10 @@ from .explanation import AskedPlace
 
 #: The dimension by which stages know the points that are explained: negative.
 _OUTSIDE = f"{RESERVED}Outside"
+#: Dimensions that are read where a file has them.
+_READ = (*USUAL, "ClassFlags", "HeightAboveGround", "Reliability", "Checked")
+#: Meters beyond the reach of the model and what follows, for neighbors of sparse points.
+_MARGIN_M = 32.0
 #: Farthest that the nearest point may be, in meters, ...
 _FARTHEST_M = 2.0
 #: ... or in mean distances between points, where these are larger.
@@ -38,7 +42,8 @@ _FARTHEST_SPACINGS = 3.0
 class Surroundings:
     """Points of files within a box."""
 
-    def __init__(self, files: Sequence[str], box: Sequence[float]) -> None:
+    def __init__(self, files: Sequence[str], box: Sequence[float], mentioned: str) -> None:
+        """Read the dimensions that every run needs, and those that are mentioned in a text."""
         self.files = files
         west, south, east, north = box
         parts: list[tuple[Layout, NDArray]] = []
@@ -48,7 +53,8 @@ class Surroundings:
             x0, y0, x1, y1 = layout.header.box
             if x0 > east or x1 < west or y0 > north or y1 < south:
                 continue
-            for records in read_records(path, layout):
+            names = [n for n in layout.names if n in _READ or n.lower() in mentioned.lower()]
+            for records in read_records(path, layout, only=names):
                 x, y = (layout.column(records, axis) for axis in "XY")
                 rows = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
                 parts.append((layout, records[rows] if len(rows) < len(records) else records))
@@ -63,19 +69,22 @@ class Surroundings:
 
         `unit` are the meters of a unit of the coordinates.
         """
-        found = "no point at all"
+        found, asked = "no point at all", np.array([v for v in place[:3] if v is not None])
         if len(self.number):
             xyz = np.column_stack([self.columns[axis] for axis in "XYZ"])
-            asked = np.array([value for value in place if value is not None])
             away = unit * np.sqrt(((xyz[:, : len(asked)] - asked) ** 2).sum(axis=1))
+            inside = np.flatnonzero(away <= place.doubtful_m)
+            if len(inside) and "Reliability" in self.columns:
+                row = int(inside[np.argmin(self.columns["Reliability"][inside])])
+                return row, float(away[row])
             row, near = int(np.argmin(away)), away < 50.0
             spacing = 1.0 / np.sqrt(density(xyz[near] * unit)) if near.any() else 0.0
-            if away[row] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing):
+            if away[row] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing, place.doubtful_m):
                 return row, float(away[row])
             found = f"the nearest is {away[row]:.1f} m away"
         raise StageError(
             "there is no point near this place",
-            where=" ".join(f"{value:.2f}" for value in place if value is not None),
+            where=" ".join(f"{value:.2f}" for value in asked),
             found=found,
             cure="Give X and Y in the cloud's reference system, or name theirs with --crs",
         )
@@ -88,27 +97,42 @@ class Recording:
     around: Surroundings
     request: ClassifyRequest
     reference: Reference
-    rows: NDArray[np.int64]  #: (m,) of the points
+    rows: NDArray[np.int64]  #: (m,) of the points in the surroundings
+    rows_seen: NDArray[np.int64] = field(init=False)  #: (m,) of the points among those near
     stages: list[ExpandedStage] = field(default_factory=list)
     classes: list[NDArray[np.uint8]] = field(default_factory=list)  #: (m,) after each stage
     #: by piece of the cloud what each step of the ground filter made
     pieces: list[dict[str, tuple[GridWindow, NDArray[np.float32]]]] = field(default_factory=list)
     heights: Mapping[str, NDArray] = field(default_factory=dict)  #: columns of the ground filter
     inputs: list[PassInputs] = field(default_factory=list)
-    seen: Mapping[str, NDArray] = field(default_factory=dict)  #: dimensions after all stages
+    #: dimensions of the points near after all stages
+    seen: Mapping[str, NDArray] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def run(self, pipeline: Pipeline) -> None:
-        """Run the stages; those from the model on compute the points alone."""
-        columns, outside = self.around.columns, np.ones(len(self.around.number), np.float32)
-        outside[self.rows] = -1.0
+        """Run the stages; those from the model on on points near, and for the points alone."""
+        ours, unit = pipeline.expanded.ours, self.reference.units.horizontal
         observer = Observer(self._keep, self._keep_heights, self.inputs.append)
-        facts: dict[str, str] = {}
-        for each in pipeline.expanded.ours:
-            facts |= {"outside": _OUTSIDE} if isinstance(each.stage, ApplyModel) else {}
-            each.update_context(observer=observer, **facts)
-        known = {_OUTSIDE: outside, **selection(self.request.where, columns)}
-        self.seen = pipeline.run_here(columns, self.reference.wkt, known, self._keep_classes)
+        for each in ours:
+            each.update_context(observer=observer)
+        first = next(n for n, each in enumerate(ours) if isinstance(each.stage, ApplyModel))
+        columns, wkt = self.around.columns, self.reference.wkt
+        known = selection(self.request.where, columns)
+        seen = run_stages(ours[:first], columns, wkt, known, self._keep_classes)
+        reach = (sum(each.stage.halo_m() for each in ours[first:]) + _MARGIN_M) / unit
+        x, y = (columns[axis] for axis in "XY")
+        near = np.ones(len(x), np.bool_)
+        for axis in (x, y):
+            asked = axis[self.rows]
+            near &= (axis >= asked.min() - reach) & (axis <= asked.max() + reach)
+        rows = np.flatnonzero(near)
+        self.rows_seen = np.searchsorted(rows, self.rows)
+        outside = np.ones(len(rows), np.float32)
+        outside[self.rows_seen] = -1.0
+        for each in ours[first:]:
+            each.update_context(outside=_OUTSIDE)
+        part, known = SomeRows(seen, rows), {_OUTSIDE: outside}
+        self.seen = run_stages(ours[first:], part, wkt, known, self._keep_classes)
         self.notes = [text for text in pipeline.messages if "points/m2" not in text]
 
     def _keep(self, name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
@@ -120,5 +144,6 @@ class Recording:
         self.heights = columns
 
     def _keep_classes(self, each: ExpandedStage, seen: Mapping[str, NDArray]) -> None:
+        rows = self.rows if len(seen["X"]) == len(self.around.number) else self.rows_seen
         self.stages.append(each)
-        self.classes.append(np.array(seen["Classification"][self.rows]))
+        self.classes.append(np.array(seen["Classification"][rows]))

@@ -32,7 +32,9 @@ from ..pipeline.point_files import can_read_chunks, read_columns
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of_file
 from ..reports.vector_files import Layer, check_target, qml, write_layers
 from ..stages.points import Points
+from .doubts import inputs_against
 from .expected_errors import Patches, ReviewCells, cell_side, find_patches
+from .explanation import AskedPlace
 
 #: Dimensions that are read where they exist.
 DIMENSIONS = ("Reliability", "ReturnNumber", "NumberOfReturns")
@@ -59,6 +61,7 @@ class Review:
     listed: int
     files: list[str]
     unit: float = 1.0  #: of the files' coordinates, in which places are reported, meters
+    against: Sequence[str] = ()  #: by patch, as far as known, what speaks against its class
 
     @cached_property
     def tiles(self) -> list[JsonObject]:
@@ -96,6 +99,7 @@ class Review:
                 "seconds": round(60.0 * float(p.minutes[k]), 1),
                 "per_minute": round(float(p.errors[k] / p.minutes[k]), 1),
                 "reason": p.reason[k],
+                "against": self.against[k] if k < len(self.against) else "",
                 "at": [round(float(v) / self.unit, 3) for v in p.at[k]],
             }
             for k in range(self.listed)
@@ -255,15 +259,24 @@ def compute_reliability(points: Mapping[str, NDArray], model_name: str) -> NDArr
     return np.where(column >= 0, probability, 1.0).astype(np.float32)
 
 
-def write_review(inputs: Sequence[str], output: str, json_file: str = "", **options: Any) -> Review:
+def write_review(
+    inputs: Sequence[str], output: str, json_file: str = "", reasons: int = 0, **options: Any
+) -> Review:
     """Review files, and write a vector file and, where named, a JSON file.
 
-    `options` are those of :func:`review_files`.
+    For the first patches, `reasons` of them, the inputs of the model that speak most against their
+    class are named. `options` are those of :func:`review_files`.
     """
     check_target(output, LAYERS)
     outputs = [Output(output, "review")] + [Output(json_file, "json", JSON)] * bool(json_file)
     check_outputs(outputs, [*input_files(inputs), *inputs, find(options.get("model", STANDARD))])
     review = review_files(inputs, **options)
+    middles = review.patches.at[: min(reasons, review.listed)] / review.unit
+    side = review.cells.side
+    places = [AskedPlace(x, y, doubtful_m=side) for x, y in middles.tolist()]
+    if places:
+        model = options.get("model", STANDARD)
+        review.against = inputs_against(review.files, places, model)
     layers = review_layers(review)
     wkt = reference_of_file(review.files[0]).wkt
     write_layers(output, layers, wkt, styles(review.patches.errors))
@@ -321,6 +334,7 @@ def lines(result: JsonObject) -> list[str]:
             f"{row['rank']:>5}{row['expected']:>10,.0f}{row['area']:>8,.0f}  {row['reason']}; "
             f"{one_line(row['tile'])} at {row['at'][0]:.1f}, {row['at'][1]:.1f}"
         )
+        out += [f"{'':>25}against it: {row['against']}"] if row["against"] else []
     return out
 
 

@@ -44,16 +44,17 @@ _COMPARED = {"HeightAboveGround": 1 / 32, "Reliability": 1 / 64}
 
 def trace_point(recording: Recording, place: int, distance_m: float) -> Explanation:
     """Return how a point came to its class; `place` is its number among those of the recording."""
-    row, columns = int(recording.rows[place]), recording.around.columns
+    row, at = int(recording.rows[place]), int(recording.rows_seen[place])
+    columns = recording.around.columns
     stages = [each.stage for each in recording.stages]
     model_at = next(n for n, stage in enumerate(stages) if isinstance(stage, ApplyModel))
     model_stage = stages[model_at]
     assert isinstance(model_stage, ApplyModel)
     codes = [int(columns["Classification"][row]), *(int(c[place]) for c in recording.classes)]
-    kept = _why_kept(recording, model_stage, row, codes[model_at])
+    kept = _why_kept(recording, model_stage, at, codes[model_at])
     verdict, steps = None, []
     if not kept:
-        verdict = _verdict(recording, model_stage, row, codes[0])
+        verdict = _verdict(recording, model_stage, place, codes[0])
         steps = _own_steps(model_stage, recording, row, verdict, codes[model_at + 1])
     steps += [
         (stage.type, code)
@@ -62,7 +63,7 @@ def trace_point(recording: Recording, place: int, distance_m: float) -> Explanat
     same = {}
     for name, step in _COMPARED.items():
         if name in columns and name in recording.seen and not kept:
-            gap = abs(float(columns[name][row]) - float(recording.seen[name][row]))
+            gap = abs(float(columns[name][row]) - float(recording.seen[name][at]))
             same[name] = gap <= 0.51 * step + 1e-4
     return Explanation(
         _found(recording, row, distance_m),
@@ -88,9 +89,9 @@ def _found(recording: Recording, row: int, distance_m: float) -> FoundPoint:
     return FoundPoint(file, int(around.number[row]), x, y, z, distance_m, number, returns, checked)
 
 
-def _why_kept(recording: Recording, stage: ApplyModel, row: int, code: int) -> str:
+def _why_kept(recording: Recording, stage: ApplyModel, at: int, code: int) -> str:
     """Return why the model leaves a point alone whose class was `code` before; empty if not."""
-    one = SomeRows(recording.seen, np.array([row]))
+    one = SomeRows(recording.seen, np.array([at]))
     codes = {"Classification": np.array([code], np.uint8)}
     point = stage.points(ChainMap(codes, one), wkt=recording.reference.wkt)  # type: ignore[arg-type]
     if not point.inside[0]:
@@ -178,19 +179,20 @@ def _ground(recording: Recording, row: int, stage: HagMorphological | None) -> G
 # ---- the model -----------------------------------------------------------------------------------
 
 
-def _verdict(recording: Recording, stage: ApplyModel, row: int, in_file: int) -> Verdict:
+def _verdict(recording: Recording, stage: ApplyModel, place: int, in_file: int) -> Verdict:
     """Return what the model said of a point."""
     model, names = stage.model, dict(stage.model.classes)
-    shares = {code: float(recording.seen[f"Probability_{code}"][row]) for code in names}
+    row, at = recording.rows[place], recording.rows_seen[place]
+    shares = {code: float(recording.seen[f"Probability_{code}"][at]) for code in names}
     order = sorted(names, key=lambda code: -shares[code])
     rival = in_file if in_file in names and in_file != order[0] else order[1]
     passes, stands = [], None
     for number in range(len(model.passes)):
         for each in recording.inputs:
-            if each.number == number and (at := np.flatnonzero(each.rows == row)).size:
-                passes.append(_trace_pass(model, each, int(at[0])))
+            if each.number == number and (found := np.flatnonzero(each.rows == at)).size:
+                passes.append(_trace_pass(model, each, int(found[0])))
                 own = np.column_stack(_axes(recording, np.array([row])))
-                away = float(np.linalg.norm(each.xyz[at[0]] - own))
+                away = float(np.linalg.norm(each.xyz[found[0]] - own))
                 stands = away if away > 1e-6 else None
     least = np.zeros(256) if stage.limits is None else stage.limits.least_reliability()
     limit = max(float(least[order[0]]), stage.reject_below or 0.0)
