@@ -83,7 +83,7 @@ def slow_is_wire(members, side, height):
 
 
 def slow_states(xyz, side, most):
-    """Solid 0, held 1 or loose 2 of voxels of one side, from the definition."""
+    """Solid 0, held 1, loose 2 or heavy 3 of voxels of one side, from the definition."""
     height = min(side, max(RULES.flat_m, side / 2))
     at = np.floor(xyz[:, [1, 0, 2]] / [side, side, height]).astype(int)
     voxel = list(map(tuple, at.tolist()))
@@ -95,20 +95,24 @@ def slow_states(xyz, side, most):
         least = RULES.min_around if few else RULES.min_mean * len(near)
         if sum(count[k] for k in near) >= least:
             full.append((j, i, n))
-    solid = set()
+    solid, heavy = set(), set()
     longest = max(RULES.extent_sides * side, RULES.extent_m)
     for members in slow_components(full):
         row, column, layer = np.ptp(np.array(members), axis=0)
         long = max((max(row, column) + 1) * side, layer * height) > longest
         number = sum(count[k] for k in members)
-        if long or number > most(members[0], side) or slow_is_wire(members, side, height):
+        if long or slow_is_wire(members, side, height):
             solid.update(members)
+        elif number > most(members[0], side):
+            heavy.update(members)
     states, up = {}, math.ceil(RULES.hold_sides * side / height)
-    solids = np.array(sorted(solid)).reshape(-1, 3)
     for k in count:
-        away = np.abs(solids - k)
+        holding = solid if k in heavy else solid | heavy
+        away = np.abs(np.array(sorted(holding)).reshape(-1, 3) - k)
         held = (away[:, :2].max(axis=1) <= RULES.hold_columns) & (away[:, 2] <= up)
         states[k] = 0 if k in solid else 1 if held.any() else 2
+        if k in heavy:
+            states[k] = 0 if held.any() else 3
     return np.array([states[k] for k in voxel])
 
 
@@ -162,7 +166,8 @@ def slow_noise(xyz, cluster=30, gap=GAP, depth=1.0):
     at = np.floor(xyz[:, [1, 0]] / SIDE).astype(int)
     at -= at.min(axis=0) - 1
     base, low = (np.full(at.max(axis=0) + 2, np.inf) for _ in range(2))
-    np.minimum.at(base, tuple(at[states == 0].T), xyz[states == 0, 2])
+    for state in (0, 3):
+        np.minimum.at(base, tuple(at[states == state].T), xyz[states == state, 2])
     j, i = np.mgrid[: base.shape[0], : base.shape[1]]
     codes = np.zeros(len(xyz), np.uint8)
     for p in np.flatnonzero(states == 2):
@@ -174,11 +179,33 @@ def slow_noise(xyz, cluster=30, gap=GAP, depth=1.0):
             r = min(2 * r, noise.RULES.far)
         if len(near) >= noise.RULES.min_columns and xyz[p, 2] - near.min() >= noise.RULES.above_m:
             codes[p] = 18
-    lone = (states > 0) & (codes == 0)
+    lone = (states > 0) & (states < 3) & (codes == 0)
     np.minimum.at(low, tuple(at[lone].T), xyz[lone, 2])
     limit = slow_below(low, base, SIDE, depth)
     codes[lone & (xyz[:, 2] < limit[tuple(at.T)])] = 7
+    solid, heavy = np.full((2, *base.shape), np.inf)
+    for state, lowest in ((0, solid), (3, heavy)):
+        np.minimum.at(lowest, tuple(at[states == state].T), xyz[states == state, 2])
+    limit = slow_below(heavy, solid, SIDE, depth)
+    codes[slow_buried(xyz, states, at) & (xyz[:, 2] < limit[tuple(at.T)])] = 7
     return codes
+
+
+def slow_buried(xyz, states, at):
+    """Whether points are heavy, with solid ones above most heavy ones around."""
+    out, small = np.zeros(len(xyz), bool), np.floor(xyz[:, :2] / noise.SMALL)
+    heavy, solid = np.flatnonzero(states == 3), states == 0
+    under = [
+        (solid & (small == small[p]).all(axis=1) & (xyz[:, 2] > xyz[p, 2])).any() for p in heavy
+    ]
+    # Three sums over 3 x 3 columns, of which the farthest count least.
+    weight = np.array([1, 3, 6, 7, 6, 3, 1])
+    for p in heavy:
+        away = at[heavy] - at[p] + 3
+        near = ((away >= 0) & (away <= 6)).all(axis=1)
+        each = weight[away[near]].prod(axis=1)
+        out[p] = each[np.array(under)[near]].sum() >= noise.RULES.buried * each.sum()
+    return out
 
 
 def slow_below(low, base, side, depth=1.0):
@@ -230,9 +257,13 @@ def slow_company(base, supported, at, z, plane, side):
 @pytest.mark.parametrize(("seed", "density"), [(0, 6.0), (1, 0.4), (3, 70.0)])
 def test_the_kernels_equal_the_slow_reference(seed, density):
     xyz, _ = scene(seed, 60 if density < 1 else 30, density)
+    rng = np.random.default_rng(seed)
+    many = [rng.uniform(at, np.add(at, 3), (250, 3)) for at in ((6, 6, -9), (22, 10, -6))]
+    xyz = np.concatenate([xyz, *many])
     noise_codes = detached_noise(xyz)
     assert np.array_equal(noise_codes, slow_noise(xyz))
-    assert noise_codes.any()
+    assert noise_codes[:-500].any()
+    assert noise_codes[-500:].all() == (density > 1)
 
 
 def test_clusters_below_thin_clouds():
@@ -344,6 +375,25 @@ def test_true_low_places_are_no_noise(what):
     rng = np.random.default_rng(1)
     x, y = rng.uniform(-60, 60, (2, 120_000))
     assert not detached_noise(x, y, rng.normal(0, 0.02, len(x)) + LOW_PLACES[what](x, y)).any()
+
+
+@pytest.mark.parametrize(("count", "wide", "deep"), [(300, 2, 5), (1000, 10, 30), (1000, 10, 3)])
+def test_many_echoes_from_below_are_noise(count, wide, deep):
+    rng = np.random.default_rng(2)
+    land = rng.uniform((-40, -40, 0), (40, 40, 0.1), (60_000, 3))
+    part = rng.uniform(-wide / 2, wide / 2, (count, 3)) - [0, 0, wide / 2 + deep]
+    codes = detached_noise(np.concatenate([land, part]))
+    assert not codes[: len(land)].any()
+    assert (codes[len(land) :] == 7).mean() > 0.95
+
+
+def test_threads_change_nothing(monkeypatch):
+    xyz, _ = scene(4, 60)
+    every = detached_noise(xyz, threads=1)
+    assert set(every) == {0, 7, 18}
+    monkeypatch.setattr(detached, "SHARE", 1000)
+    for threads in (1, 2, 5):
+        assert np.array_equal(detached_noise(xyz, threads=threads), every)
 
 
 # ---- the stage ------------------------------------------------------------------------------------------

@@ -34,6 +34,9 @@ SOLID: int = 0
 HELD: int = 1
 #: State of what is detached and has not.
 LOOSE: int = 2
+#: State of a compact component of more points than a cluster, with nothing solid close: ground in a
+#: courtyard, or many echoes from below.
+HEAVY: int = 3
 
 
 class DetachedRules(NamedTuple):
@@ -101,7 +104,7 @@ class Voxels(NamedTuple):
 def find_detached(
     x: NDArray, y: NDArray, z: NDArray, cluster: int, gap: float, threads: int | None = None
 ) -> NDArray[np.uint8]:
-    """Return which points (n,) are `SOLID`, and of the others which are `HELD` and `LOOSE`.
+    """Return which points (n,) are `SOLID`, and which of the others `HELD`, `LOOSE` and `HEAVY`.
 
     Parameters
     ----------
@@ -119,7 +122,7 @@ def find_detached(
         x, y, z, (row - bottom) * shape[1] + column - left, int(left), int(bottom), shape
     )
     count = np.bincount(points.block, minlength=shape[0] * shape[1]).reshape(shape)
-    density = _sum_around(count) / np.maximum(1, _sum_around(count > 0)) / BLOCK_M**2
+    density = sum_around(count) / np.maximum(1, sum_around(count > 0)) / BLOCK_M**2
     density = np.where(count > 0, density, 1.0)
     scale = np.searchsorted(RULES.sides, gap * (RULES.dense_per_m2 / density) ** (1 / 3))
     scale = np.where(count > 0, np.minimum(scale, len(RULES.sides) - 1), -1)
@@ -144,8 +147,8 @@ def find_detached(
     return state
 
 
-def _sum_around(values: NDArray) -> NDArray[np.int64]:
-    """Sum whole numbers (h, w) over the 3 x 3 places around each."""
+def sum_around(values: NDArray) -> NDArray[np.int64]:
+    """Return the sums of whole numbers (h, w) over the 3 x 3 places around each."""
     (h, w), padded = values.shape, np.pad(values.astype(np.int64), 1)
     return sum((padded[j : j + h, i : i + w] for j in range(3) for i in range(3)), np.int64(0))
 
@@ -153,7 +156,7 @@ def _sum_around(values: NDArray) -> NDArray[np.int64]:
 def _dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     """Return the places (h, w) at most `radius` places away, along either axis, from the mask's."""
     for _ in range(radius):
-        mask = _sum_around(mask) > 0
+        mask = sum_around(mask) > 0
     return mask
 
 
@@ -253,12 +256,12 @@ def _judge(keys, counts, most, frame: Voxels, threads: int | None) -> NDArray[np
     for _, end in spans[:-1]:  # what touches across the end of a span
         begin = np.searchsorted(keys, keys[end] - last_row)
         _join(keys, around, frame.width, begin, end, number, parent)
-    solid = np.empty(number, np.bool_)
-    _mark_solid(keys, counts, around, parent, most, frame, RULES, solid)
-    state = np.where(solid, np.uint8(SOLID), np.uint8(LOOSE))
+    alone = np.empty(number, np.uint8)
+    _judge_components(keys, counts, around, parent, most, frame, RULES, alone)
+    state = alone.copy()
 
     def hold(span):
-        _hold(keys, solid, frame, *span, RULES, state)
+        _hold(keys, alone, frame, *span, RULES, state)
 
     for _ in map_blocks(hold, spans, threads):
         pass
@@ -308,8 +311,11 @@ def _join(keys, full, width, begin, end, stop, parent):
 
 
 @njit
-def _mark_solid(keys, counts, full, parent, most, frame, rules, solid):
-    """Find the voxels of components that are large, or long and thin."""
+def _judge_components(keys, counts, full, parent, most, frame, rules, state):
+    """Find the states of voxels by their components alone: `SOLID`, `HEAVY` or `LOOSE`.
+
+    Components are solid that are wide, or long and thin, heavy with more points than a cluster.
+    """
     number, label = 0, np.full(len(keys), -1)
     for k in range(len(keys)):
         if full[k]:
@@ -326,7 +332,7 @@ def _mark_solid(keys, counts, full, parent, most, frame, rules, solid):
                 first[n] = k
             size[n] += counts[k]
             _extend(keys[first[n]], keys[k], frame.width, low[n], high[n], sums[n])
-    big = np.empty(number, np.bool_)
+    of_component = np.empty(number, np.uint8)
     for n in range(number):
         row, column = divmod(keys[first[n]] >> BITS, frame.width)
         j = int((row - rules.hold_columns) * frame.side / BLOCK_M)
@@ -334,11 +340,14 @@ def _mark_solid(keys, counts, full, parent, most, frame, rules, solid):
         flat = max(high[n, 0] - low[n, 0], high[n, 1] - low[n, 1])
         rise = (high[n, 2] - low[n, 2]) * frame.height
         longest = max(rules.extent_sides * frame.side, rules.extent_m)
-        big[n] = size[n] > most[j, i] or max((flat + 1) * frame.side, rise) > longest
+        wide = max((flat + 1) * frame.side, rise) > longest
         long = flat + 1 >= rules.line_columns and (flat + 1) * frame.side >= rules.line_m
-        big[n] |= long and _is_line(sums[n], rise / (flat * frame.side), rules)
+        if wide or (long and _is_line(sums[n], rise / (flat * frame.side), rules)):
+            of_component[n] = SOLID
+        else:
+            of_component[n] = HEAVY if size[n] > most[j, i] else LOOSE
     for k in range(len(keys)):
-        solid[k] = full[k] and big[label[k]]
+        state[k] = of_component[label[k]] if full[k] else LOOSE
 
 
 @device
@@ -364,17 +373,23 @@ def _is_line(sums, slope, rules):
 
 
 @njit
-def _hold(keys, solid, frame, begin, end, rules, state):
-    """Mark what is detached and has something solid close, as far up and down as a side."""
+def _hold(keys, alone, frame, begin, end, rules, state):
+    """Find what has something solid close, as far up and down as a side: it holds what is detached.
+
+    What is heavy is solid then. `alone` (n,) are the states of :func:`_judge_components`.
+    """
     layers = int(np.ceil(rules.hold_sides * frame.side / frame.height))
     for k in range(begin, end):
-        if solid[k]:
+        if alone[k] == SOLID:
             continue
         for j in range(-rules.hold_columns, rules.hold_columns + 1):
             for i in range(-rules.hold_columns, rules.hold_columns + 1):
                 at = keys[k] + ((j * frame.width + i) << BITS)
                 other = np.searchsorted(keys, at - layers)
                 while other < len(keys) and keys[other] <= at + layers:
-                    if solid[other]:
+                    if alone[k] == HEAVY:
+                        if alone[other] == SOLID:
+                            state[k] = SOLID
+                    elif alone[other] != LOOSE:
                         state[k] = HELD
                     other += 1

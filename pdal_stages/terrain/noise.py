@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.asprs import NOISE
-from ..base.grid import cell_numbers
+from ..base.grid import cell_keys, cell_numbers, places_among
 from ..base.jit import njit
 from .cells import columns, usable
-from .detached import HELD, LOOSE, SOLID, find_detached
+from .detached import HEAVY, HELD, LOOSE, SOLID, find_detached, sum_around
 from .detached import REACH as DETACHED_REACH
 from .low_outliers import limits_below_ground
 from .low_outliers import reach as low_reach
@@ -27,6 +27,8 @@ LOW: int = NOISE[0]
 HIGH: int = NOISE[1]
 #: Side in meters of the columns whose lowest solid points tell where the ground is.
 SIDE = 1.5
+#: The same of those that tell what lies under others, which takes some 2 points/m2.
+SMALL = 1.0
 
 
 class NoiseRules(NamedTuple):
@@ -36,6 +38,7 @@ class NoiseRules(NamedTuple):
     aside: int = 3  #: columns around in which that is looked for ...
     far: int = 20  #: ... or up to so many, until enough hold points
     min_columns: int = 12  #: columns with points: below fewer nothing is judged
+    buried: float = 0.8  #: share of heavy points that solid ones lie above, at least, in low noise
 
 
 RULES = NoiseRules()
@@ -107,17 +110,49 @@ def _judge(x, y, z, column, row, state, depth) -> NDArray[np.uint8]:
     left, bottom = column.min() - 1, row.min() - 1
     shape = int(row.max() - bottom + 2), int(column.max() - left + 2)
     place = (row - bottom) * shape[1] + column - left
-    base, low = np.full(shape, np.inf), np.full(shape, np.inf)
+    base, low, solid, heavy = np.full((4, *shape), np.inf)
+    buried = _find_buried(x, y, z, place, state, shape)
     codes = np.zeros(len(z), np.uint8)
-    _lowest(place, z, state, SOLID, SOLID, base.ravel())
+    _lowest(place, z, state, SOLID, SOLID, solid.ravel())
     detached = np.flatnonzero(state)
     place, z, state = place[detached], z[detached], state[detached]
+    _lowest(place, z, state, HEAVY, HEAVY, heavy.ravel())
+    np.minimum(solid, heavy, out=base)
     marks = np.where(_stand_above(place, z, state, base, RULES), HIGH, 0)
     _lowest(place, z, np.where(marks == HIGH, SOLID, state), HELD, LOOSE, low.ravel())
-    limit = limits_below_ground(low, base, SIDE, depth)
-    marks[(marks == 0) & (z < limit.ravel()[place])] = LOW
+    limit = limits_below_ground(low, base, SIDE, depth).ravel()
+    marks[(marks == 0) & (state != HEAVY) & (z < limit[place])] = LOW
+    if np.isfinite(heavy).any():
+        limit = limits_below_ground(heavy, solid, SIDE, depth).ravel()
+        marks[buried[detached] & (z < limit[place])] = LOW
     codes[detached] = marks
     return codes
+
+
+def _find_buried(x, y, z, place, state, shape) -> NDArray[np.bool_]:
+    """Return which points (n,) are heavy and lie under solid ones, as nearly all heavy ones near.
+
+    Ground in a courtyard or a pit has no roof; echoes from below have the ground above them.
+    """
+    buried = np.zeros(len(z), np.bool_)
+    heavy = np.flatnonzero(state == HEAVY)
+    if not len(heavy):
+        return buried
+    count, under = np.zeros((2, shape[0] * shape[1]), np.int64)
+    np.add.at(count, place[heavy], 1)
+    above = np.flatnonzero((count[place] > 0) & (state == SOLID))
+    small = [cell_keys(*(cell_numbers(a[k], SMALL) for a in (x, y))) for k in (heavy, above)]
+    keys = np.unique(small[0])
+    at, there = places_among(keys, small[1])
+    top = np.full(len(keys), -np.inf)
+    np.maximum.at(top, at[there], z[above[there]])
+    is_under = z[heavy] < top[np.searchsorted(keys, small[0])]
+    np.add.at(under, place[heavy[is_under]], 1)
+    sums = [each.reshape(shape) for each in (count, under)]
+    for _ in range(RULES.aside):
+        sums = [sum_around(each) for each in sums]
+    buried[heavy] = (sums[1] >= RULES.buried * sums[0]).ravel()[place[heavy]]
+    return buried
 
 
 @njit
