@@ -14,6 +14,7 @@ from pdal_stages.base.errors import OptionError, StageError
 from pdal_stages.base.vector import Overlay, points_inside
 from pdal_stages.stages.base import WHOLE_CLOUD, StageContext
 from pdal_stages.stages.polygons import Polygons
+from pdal_stages.synthetic import write_town
 
 pyogrio, shapely, pyproj = (pytest.importorskip(name) for name in ("pyogrio", "shapely", "pyproj"))
 RD = 28992
@@ -226,8 +227,18 @@ def test_damaged_files_are_errors_of_ours(tmp_path):
     stage = Polygons({"polygons": [f"{path}=9"]})
     points = stage.points(cloud(), wkt=pyproj.CRS(RD).to_wkt("WKT1_GDAL"))
     Path(path).write_bytes(b"no GeoPackage any more")
-    with pytest.raises(StageError, match=r"lake.gpkg: the vector file cannot be read"):
+    with pytest.raises(StageError, match=r"lake.gpkg: GDAL knows no format"):
         stage.run(points, WHOLE_CLOUD)
+
+
+def test_a_file_that_is_no_map_is_named_for_what_it_is(tmp_path):
+    (tmp_path / "lake.gpkg").write_bytes(b"")
+    write_town(ps.make_town(20.0, 2.0, seed=1, progress=False), tmp_path / "town.laz")
+    nothing = "an empty file or a device"
+    files = {"/dev/null": nothing, tmp_path / "lake.gpkg": nothing, tmp_path / "town.laz": "LAS"}
+    for path, kind in files.items():
+        with pytest.raises(StageError, match=f"GDAL knows no format .*{kind}.*Give a GeoPackage"):
+            Polygons({"polygons": [f"{path}=9"]})
 
 
 def test_points_inside_are_counted_in_the_tile_alone(tmp_path):

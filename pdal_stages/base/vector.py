@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .asprs import GROUND
 from .errors import OptionError, StageError, optional_import
+from .files import kind_of
 from .processes import PythonProcess
 
 
@@ -36,6 +37,10 @@ def refuse_odd_name(path: str) -> None:
         raise StageError(what, found=ascii(os.path.abspath(path)), cure="Give another")
 
 
+#: How GDAL says that no driver takes a file.
+_NO_DRIVER = "not recognized as being in a supported file format"
+
+
 @contextmanager
 def reading(
     path: str,
@@ -49,6 +54,13 @@ def reading(
     except (StageError, MemoryError):
         raise
     except Exception as error:  # each package has its own
+        if _NO_DRIVER in str(error):
+            raise StageError(
+                "GDAL knows no format of vector data that this file is in",
+                where=path,
+                found=kind_of(path) or "an empty file or a device",
+                cure="Give a GeoPackage, a shapefile, GeoJSON or FlatGeobuf",
+            ) from None
         raise StageError(
             what, where=path, found=f"{type(error).__name__}: {error}", cure=cure
         ) from error
