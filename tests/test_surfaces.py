@@ -353,6 +353,34 @@ def test_a_tile_without_ground_takes_it_from_its_neighbors(tmp_path):
     same(read(tmp_path / "a"), read(tmp_path / "b"))
 
 
+@pytest.mark.parametrize("tile", [None, 30.0, 1e4])
+def test_far_points_that_are_alone_are_left_out_and_named(survey, whole, tmp_path, capsys, tile):
+    """Two at one place and one at another, in a file of their own or with the others."""
+    xyz, codes = survey
+    far = xyz[[0, 0, 0]] + np.array([[90_000, 40_000, 0], [90_000, 40_000, 1], [0, -7_000, 0]])
+    both = write(tmp_path / "both.laz", np.vstack([xyz, far]), [*codes, 2, 6, 2])
+    tiling = TilingOptions(tile=tile, workers=0)
+    result = write_surfaces([both], str(tmp_path / "out"), SMALL, tiling, progress=False)
+    same(read(tmp_path / "out"), read(whole[1] / "out"))
+    said = capsys.readouterr().err
+    assert "3 points left out of rasters" in said and str(both) in said
+    assert (
+        f"{far[2, 0]:.2f} {far[2, 1]:.2f} of" in said
+        or f"{far[0, 0]:.2f} {far[0, 1]:.2f} of" in said
+    )
+    assert result["width"] < 1000
+
+
+def test_a_few_points_far_away_make_rasters_wide_and_a_message_says_so(survey, tmp_path, capsys):
+    xyz, codes = survey
+    far = xyz[:5] + np.array([9_000, 9_000, 0])
+    cloud = write(tmp_path / "both.laz", np.vstack([xyz, far]), [*codes, *codes[:5]])
+    result = write_surfaces([cloud], str(tmp_path / "out"), SurfaceOptions(), progress=False)
+    said = capsys.readouterr().err
+    assert "cells have a height: points far from the others" in said and "left out" not in said
+    assert result["width"] > 9_000
+
+
 def test_withheld_points_and_flags_of_old_files(tmp_path):
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, 20.0, 0.5), np.arange(0, 20.0, 0.5)))
     xyz = np.column_stack([x + X, y + Y, np.full(len(x), 10.0)])

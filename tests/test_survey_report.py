@@ -171,6 +171,20 @@ def test_points_that_come_twice_count_once(result, cloud, control, tmp_path):
         assert twice[name] == result[name], name
 
 
+def test_a_far_point_is_counted_named_and_in_no_raster(result, cloud, control, tmp_path, capsys):
+    las = laspy.read(cloud)
+    las.points = las.points[[*range(len(las.points)), 100]]
+    las.x[-1] += 80_000
+    las.update_header()
+    las.write(str(tmp_path / "far.laz"))
+    page = str(tmp_path / "far.html")
+    again = write_report([str(tmp_path / "far.laz")], page, control=str(control), progress=False)
+    assert "1 point left out of rasters" in capsys.readouterr().err
+    assert again["survey"]["points"] == result["survey"]["points"] + 1
+    for part in ("voids", "strips", "control"):
+        assert again[part] == result[part]
+
+
 def test_the_page(result, cloud):
     page = cloud.with_name("report.html").read_text()
     assert page.count("<img") == 5 and "<script" not in page and "Signature" in page

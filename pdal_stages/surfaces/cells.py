@@ -6,7 +6,7 @@ the same ones. What is kept of a cell does not depend on the order of points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,8 @@ from ..base import checks
 from ..base.asprs import NOISE, TERRAIN, WIRES_AND_TOWERS
 from ..base.grid import GridWindow, begins_run, cell_numbers
 from ..base.json_types import JsonObject
-from ..tiling.options import LARGEST_TILE, TILE_POINT, Density
+from ..tiling.inputs import LonePoints
+from ..tiling.options import LARGEST_TILE, TILE_POINT, Density, TileGrid
 from ..tiling.tile_records import Part
 
 Integers = NDArray[np.int64]
@@ -28,6 +29,8 @@ EMPTY = np.iinfo(np.int64).min // 4
 #: meters: the RMSE at held-out ground of four clouds rose by at most 0.026 m over that of all
 #: points, with one of each meter by 0.043 (benchmarks/terrain_points.py).
 PER_SIDE, LARGEST_SIDE = 2, 0.5
+#: Most cells along a tile: in those without points time and memory are spent, too (not tuned).
+MOST_ALONG = 2048
 #: Bytes of a cell of the rasters, and of a ground point that is triangulated, of measured peaks.
 _CELL_BYTES, _GROUND_BYTES = 150, 1200
 
@@ -65,12 +68,18 @@ def steps(coordinate: NDArray) -> Integers:
     return np.rint(np.asarray(coordinate) * STEPS).astype(np.int64)
 
 
-def reduce_points(
-    parts: Sequence[Part], options: SurfaceOptions, unit: float
-) -> tuple[dict[str, NDArray], JsonObject]:
-    """Reduce points of a tile (files and their dimensions) to cells.
+def usable(part: Mapping[str, NDArray], lone: LonePoints) -> NDArray[np.bool_]:
+    """Return which points (n,) count: not noise, not withheld, not alone."""
+    kept = ~np.isin(part["Classification"], NOISE) & (part["Withheld"] == 0)
+    return kept & ~lone.among(part["X"], part["Y"])
 
-    Noise and withheld points are left out. `unit` is that of the coordinates, in meters.
+
+def reduce_points(
+    parts: Sequence[Part], lone: LonePoints, options: SurfaceOptions, unit: float
+) -> tuple[dict[str, NDArray], JsonObject]:
+    """Reduce the usable points of a tile (files and their dimensions) to cells.
+
+    `unit` is that of the coordinates, in meters.
 
     Returns
     -------
@@ -83,8 +92,7 @@ def reduce_points(
     """
     columns = []
     for _, part in parts:
-        codes = part["Classification"]
-        kept = ~np.isin(codes, NOISE) & (part["Withheld"] == 0)
+        codes, kept = part["Classification"], usable(part, lone)
         xyz = np.column_stack([steps(part[name][kept]) for name in "XYZ"])
         columns.append((xyz.reshape(-1, 3), codes[kept]))
     xyz = np.concatenate([np.empty((0, 3), np.int64), *(points for points, _ in columns)])
@@ -131,6 +139,16 @@ class CellDensity(Density):
 
     options: SurfaceOptions = SurfaceOptions()
     unit: float = 1.0  #: meters per unit of the coordinates
+
+    def is_fair(self, side: float) -> bool:
+        """Return whether tiles of this side have not too many points or cells."""
+        return super().is_fair(side) and side <= MOST_ALONG * self.options.resolution
+
+    def grid_around(self) -> TileGrid | None:
+        """Return the grid of the smallest tiles of which one holds all inputs and is fair."""
+        x0, y0, x1, y1 = self.box
+        fair = max(x1 - x0, y1 - y0) <= MOST_ALONG * self.options.resolution
+        return super().grid_around() if fair else None
 
     @property
     def alone(self) -> int:

@@ -27,7 +27,7 @@ _PLAIN = {
     "tiled": True, "blockxsize": 512, "blockysize": 512, "sparse_ok": True,
 }  # fmt: skip
 _CLOUD_OPTIMIZED = {
-    "driver": "COG", "compress": "DEFLATE", "predictor": "YES", "blocksize": 512,
+    "driver": "COG", "sparse_ok": True, "compress": "DEFLATE", "predictor": "YES", "blocksize": 512,
     "overview_resampling": "AVERAGE", "bigtiff": "IF_SAFER",
 }  # fmt: skip
 

@@ -16,6 +16,7 @@ from ..base.files import Output, check_outputs
 from ..base.geotiff import rasterio
 from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
+from ..base.messages import print_messages
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.inputs import Survey
 from ..tiling.options import Density, TilingOptions
@@ -23,6 +24,10 @@ from ..tiling.tile_records import RecordRun, Tile, earlier_layout, plan_of_recor
 from .cells import CellDensity, SurfaceOptions, reduce_points
 from .geotiff import write_rasters
 from .rasters import RASTERS, TileCells, compute_tile
+
+#: Share of cells with a height below which a message says so: 0.1 % are a line 100 m wide that
+#: crosses 70 km.
+_NEARLY_EMPTY = 1e-3
 
 
 class CellSurvey(Survey):
@@ -119,8 +124,14 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> Jso
             (arrays,) = run.arrays([job], name, "window")
             yield GridWindow(*arrays["window"].tolist()), arrays[name]
 
-    write_rasters(paths, parts, window, size, survey.reference, RASTERS)
     known = {name: sum(job.record[name] for job in jobs) for name in RASTERS}
+    if (share := known["surface"] / (window.width * window.height)) < _NEARLY_EMPTY:
+        print_messages(
+            f"{100 * share:.2g} % of {window.width:,} x {window.height:,} cells have a height: "
+            "points far from the others make the rasters this wide; if these are errors, mark them "
+            "as noise (7)"
+        )
+    write_rasters(paths, parts, window, size, survey.reference, RASTERS)
     shown = {name: str(path) for name, path in paths.items()}
     return {"files": shown, "width": window.width, "height": window.height, "known": known}
 

@@ -11,13 +11,14 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import NOISE, OVERLAP, TERRAIN, WATER
+from ..base.asprs import OVERLAP, TERRAIN, WATER
 from ..base.distinct import DistinctPoints
 from ..base.grid import GridWindow, cell_numbers
 from ..base.json_types import JsonObject
+from ..tiling.inputs import LonePoints
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.tile_records import Part
-from .cells import EMPTY, STEPS, Integers, steps
+from .cells import EMPTY, STEPS, Integers, steps, usable
 
 #: Of points without times: a first time that is later than all.
 NEVER = 1e300
@@ -88,7 +89,7 @@ def _is_last(part: Mapping[str, NDArray]) -> NDArray[np.bool_]:
 
 
 def reduce_for_report(
-    parts: Sequence[Part], rules: ReportRules, control: NDArray[np.float64]
+    parts: Sequence[Part], lone: LonePoints, rules: ReportRules, control: NDArray[np.float64]
 ) -> tuple[dict[str, NDArray], JsonObject]:
     """Reduce points of a tile: files and their dimensions.
 
@@ -100,14 +101,14 @@ def reduce_for_report(
         else 1; ``picture`` is 256 x height in steps + class of the highest point. ``strips``
         (k, 5) int64: source, column, row, sum of heights in steps, and number of ground points.
         ``control`` (m, 3) int64: ground points near control points (c, 2), in steps.
-        Noise, withheld points and those that come twice are left out.
+        Points that are not usable or come twice are left out.
     figures : dict
         ``files``: see :func:`describe`; ``repeated``: points that come twice.
     """
     columns, distinct = [], DistinctPoints()
     for _, part in parts:
         codes = part["Classification"]
-        kept = ~np.isin(codes, NOISE) & (part["Withheld"] == 0)
+        kept = usable(part, lone)
         kept &= distinct.first({**{axis: part[axis] for axis in "XYZ"}, "GpsTime": _times(part)})
         xyz = [steps(part[name]) for name in "XYZ"]
         more = codes, _is_last(part), part["PointSourceId"]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..base import las, las_check
 from ..base.errors import PipelineError, StageError
+from ..base.grid import cell_keys, key_offset, places_among
 from ..base.hashing import digest_of_file, fingerprint
 from ..base.json_types import JsonObject, StageJson
 from ..base.las_points import Layout
@@ -39,6 +41,19 @@ from .options import (
 )
 from .plan import TilePlan, outputs_for
 
+#: Side of a square in meters: ground points in squares that do not touch make no triangle whose
+#: circle has a radius of at most 100 m, the default of terrain models.
+LONE_M = 250.0
+#: Points that make a triangle: fewer within a square and those around are alone.
+_COMPANY = 3
+
+
+def sum_points(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (m, 3) squares with their points, each square once, ascending: column, row, points."""
+    squares, which = np.unique(rows[:, :2], axis=0, return_inverse=True)
+    points = np.bincount(which.reshape(-1), rows[:, 2], len(squares))
+    return np.column_stack([squares, points.astype(np.int64)])
+
 
 @dataclass(frozen=True)
 class CloudIndex:
@@ -52,6 +67,7 @@ class CloudIndex:
     grid: TileGrid  #: of the cells
     digest: str  #: SHA-256 of the input
     changed_ns: int  #: time of the input's last change of content or status, which no program sets
+    squares: NDArray[np.int64]  #: (k, 3): column and row in :attr:`Survey.lone_grid`, points
     copy: str = ""  #: the file with the points; empty where an earlier run had it
 
     @classmethod
@@ -62,7 +78,8 @@ class CloudIndex:
         grid = TileGrid(*map(float, record["grid"]))
         digest, changed_ns = str(record["digest"]), int(record["changed_ns"])
         box = tuple(record["box"])
-        return cls(int(record["count"]), box, tiles, cells, grid, digest, changed_ns, copy)
+        squares = np.array(record["squares"], np.int64).reshape(-1, 3)
+        return cls(int(record["count"]), box, tiles, cells, grid, digest, changed_ns, squares, copy)
 
     def is_of(self, path: str) -> bool:
         """Return whether the input still holds the bytes that were read.
@@ -76,6 +93,20 @@ class CloudIndex:
             )
         except OSError:
             return False
+
+
+@dataclass(frozen=True)
+class LonePoints:
+    """Points that have fewer than two others in the same square and the eight around it."""
+
+    grid: TileGrid  #: of the squares
+    keys: NDArray[np.int64]  #: (k,) their squares, sorted
+
+    def among(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which points (n,) are lone ones."""
+        if not len(self.keys):
+            return np.zeros(len(x), bool)
+        return places_among(self.keys, cell_keys(self.grid.index(x), self.grid.index(y)))[1]
 
 
 @dataclass
@@ -262,6 +293,28 @@ class Survey:
         self.messages += filter(None, dict.fromkeys(each.note for each in references.values()))
         first, *others = references.values()
         return next((each for each in others if each.name and not first.name), first)
+
+    @property
+    def lone_grid(self) -> TileGrid:
+        """Return the squares in which it is counted whether points are alone."""
+        return TileGrid(LONE_M / self.unit)
+
+    def find_lone_points(self) -> LonePoints:
+        """Return the points that are alone, all inputs together; none if all are.
+
+        They follow from the points alone, whatever the tiles.
+        """
+        held = [source.index.squares for source in self.readable() if source.index]
+        squares = sum_points(np.concatenate([np.empty((0, 3), np.int64), *held]))
+        squares = squares[np.lexsort(squares.T[:2])]  # as keys ascend
+        key, points = cell_keys(squares[:, 0], squares[:, 1]), squares[:, 2]
+        few = np.flatnonzero(points < _COMPANY)
+        around = np.zeros(len(few), np.int64)
+        for columns, rows in product((-1, 0, 1), repeat=2) if len(few) else ():
+            place, there = places_among(key, key[few] + key_offset(columns, rows))
+            around += np.where(there, points[place], 0)
+        lone = key[few[around < _COMPANY]]
+        return LonePoints(self.lone_grid, lone if len(lone) < len(key) else lone[:0])
 
     @property
     def layout(self) -> dict[str, float]:

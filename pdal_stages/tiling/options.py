@@ -246,6 +246,10 @@ class Density:
                 return grid
         return None
 
+    def is_fair(self, side: float) -> bool:
+        """Return whether tiles of this side are not too large to be made at once."""
+        return self.each * side**2 <= _MOST_OF_A_TILE
+
     @property
     def alone(self) -> int:
         """Return the points of the only tile of a small survey."""
@@ -283,7 +287,7 @@ def choose_tiles(
     local = 0 if options.scheduler else options.local_workers
     fixed = options.workers is not None or local <= 1
     # Tiles with a few points at least, and not too many.
-    fair = [side for side in _SIDES if density.each * side**2 <= _MOST_OF_A_TILE] or _SIDES[:1]
+    fair = [side for side in _SIDES if density.is_fair(side)] or _SIDES[:1]
     sides = fair if options.tile is None else [options.tile]
     largest = density.largest if options.per == "file" else 0
 

@@ -7,7 +7,6 @@ removed at the end of the run.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from ..base.hashing import digest_of_file
 from ..base.json_types import JsonObject
 from ..base.las_points import Layout, read_records
 from ..terrain.pieces import refuse_scattered
-from .inputs import CloudIndex, InputSource
+from .inputs import CloudIndex, InputSource, sum_points
 from .options import Box, TileGrid, check_number
 
 #: What messages call the copy.
@@ -33,9 +32,6 @@ _PART = 1_000_000
 #: tiles are whole cells in floats, too. Finer cells: fewer points are read in vain, in more places
 #: of the file; not tuned.
 _CELLS = 4
-#: Points are alone if no other lies in the same square of this side, at least: small tiles are no
-#: sign of damage.
-_PLACE = 250.0
 
 
 # ---- the copy, sorted by location ----------------------------------------------------------------
@@ -46,15 +42,15 @@ def _copy_type(layout: Layout) -> np.dtype:
     return np.dtype([("number", "<i8"), ("record", layout.dtype)])
 
 
-def sort_points(path: str, grid: TileGrid, target: str) -> JsonObject:
+def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> JsonObject:
     """Read a file once, write its points into a sorted copy, and return their index as a record.
 
-    :class:`CloudIndex` parses it.
+    :class:`CloudIndex` parses it. `lone_grid` is :attr:`.Survey.lone_grid`.
     """
     layout = Layout.of_file(path)
     dtype, cells = _copy_type(layout), grid.scaled(1 / _CELLS)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    parts = [np.empty((0, 4), np.int64)]
+    parts, held_squares = [np.empty((0, 4), np.int64)], [np.empty((0, 3), np.int64)]
     total = 0
     changed_ns, digest = os.stat(path).st_ctime_ns, digest_of_file(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
@@ -64,31 +60,37 @@ def sort_points(path: str, grid: TileGrid, target: str) -> JsonObject:
             high = np.maximum(high, (x.max(), y.max()))
             column, line = cells.index(x), cells.index(y)
             order = np.lexsort((column, line))
-            column, line = column[order], line[order]
-            starts = np.flatnonzero(begins_run(column) | begins_run(line))
             rows = np.empty(len(records), dtype)
             rows["number"] = total + order
             rows["record"] = records[order]
             out.write(rows.tobytes())
-            counts = np.diff([*starts, len(order)])
-            parts.append(np.column_stack([column[starts], line[starts], total + starts, counts]))
+            starts, counts = _runs(column[order], line[order])
+            first = order[starts]
+            parts.append(np.column_stack([column[first], line[first], total + starts, counts]))
+            column, line = lone_grid.index(x)[order], lone_grid.index(y)[order]
+            starts, counts = _runs(column, line)
+            held_squares.append(np.column_stack([column[starts], line[starts], counts]))
             total += len(records)
         held = np.concatenate(parts)
-        tiles = _squares(held, _CELLS)  # which cells divide exactly: powers of two do in floats
+        # Cells divide tiles exactly: powers of two do in floats.
+        tiles = sum_points(np.column_stack([held[:, :2] // _CELLS, held[:, 3]]))
         check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
-    refuse_scattered(_squares(held, math.ceil(_PLACE / cells.size))[:, 2].tolist())
+    squares = sum_points(np.concatenate(held_squares))
+    refuse_scattered(squares[:, 2].tolist())
     box = [*low.tolist(), *high.tolist()]
     return {
         **{"count": total, "box": box, "tiles": tiles.tolist(), "cells": held.tolist()},
         **{"grid": [cells.size, cells.origin], "changed_ns": changed_ns, "digest": digest},
+        "squares": squares.tolist(),
     }
 
 
-def _squares(cells: NDArray[np.int64], side: int) -> NDArray[np.int64]:
-    """Return (m, 3) squares of `side` cells that hold points, ascending: column, row, points."""
-    squares, square_of_cell = np.unique(cells[:, :2] // side, axis=0, return_inverse=True)
-    points = np.bincount(square_of_cell.reshape(-1), cells[:, 3], len(squares))
-    return np.column_stack([squares, points.astype(np.int64)])
+def _runs(
+    column: NDArray[np.int64], row: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first (m,) of points that follow each other in a square, and their number."""
+    starts = np.flatnonzero(begins_run(column) | begins_run(row))
+    return starts, np.diff([*starts, len(column)])
 
 
 def points_near(layout: Layout, index: CloudIndex, box: Box) -> tuple[NDArray[np.int64], NDArray]:

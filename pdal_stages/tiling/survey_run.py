@@ -103,7 +103,8 @@ class SurveyRun:
 
         def task_of(job: Job) -> Callable[[], Any]:
             assert job.source is not None
-            return partial(sort_points, job.source.path, survey.grid, copy_of(job))
+            grids = survey.grid, survey.lone_grid
+            return partial(sort_points, job.source.path, *grids, copy_of(job))
 
         for job in self.do("reading the inputs", waiting, task_of):
             assert job.source is not None

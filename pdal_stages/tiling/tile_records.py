@@ -25,7 +25,7 @@ from ..base.json_types import JsonObject
 from ..base.las_points import RecordColumns
 from ..base.messages import count_of, print_messages
 from ..base.version import build
-from .inputs import InputSource, Survey
+from .inputs import LONE_M, InputSource, LonePoints, Survey
 from .jobs import Job, Store, load_arrays, save_arrays
 from .options import TileGrid, TilingOptions
 from .plan import TilePlan
@@ -36,8 +36,8 @@ from .survey_run import SurveyRun, workers_of
 #: Points of an input: its path, and their dimensions by PDAL's names.
 Part = tuple[str, Mapping[str, NDArray]]
 #: Reduces the points of a tile, those of each input that has any there, to arrays and figures that
-#: JSON can hold.
-Reduce = Callable[[list[Part]], tuple[dict[str, NDArray], JsonObject]]
+#: JSON can hold. Lone points are to be left out of the arrays.
+Reduce = Callable[[list[Part], LonePoints], tuple[dict[str, NDArray], JsonObject]]
 #: Column and row of a tile.
 Tile = tuple[int, int]
 #: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
@@ -68,7 +68,9 @@ class RecordRun(SurveyRun):
         self.read_inputs()
         tiles = survey.tiles()
         near = {tile: survey.near(tile, 0.0) for tile in tiles}
-        marks = {tile: [settings, [each.content for each in near[tile]]] for tile in tiles}
+        lone = survey.find_lone_points()
+        common = [settings, lone.keys.tolist()]
+        marks = {tile: [common, [each.content for each in near[tile]]] for tile in tiles}
         jobs = self._jobs(name, tiles, marks)
         waiting = self._without_arrays(jobs)
         self.read_inputs({source.path for job in waiting for source in near[job.tile]})
@@ -78,9 +80,10 @@ class RecordRun(SurveyRun):
 
         def task_of(job: Job) -> Callable[[], Any]:
             sources = near[job.tile]
-            return partial(_reduce_tile, grid, job.tile, sources, reduce, self.path_of(job))
+            return partial(_reduce_tile, grid, job.tile, sources, reduce, lone, self.path_of(job))
 
         self._finish("reducing tiles", waiting, task_of)
+        print_messages(*_name_lone([point for job in jobs for point in job.record["lone"]]))
         return jobs
 
     def compute(
@@ -191,12 +194,32 @@ def cells_in_tile(grid: TileGrid, tile: Tile, side: float) -> GridWindow:
 
 
 def _reduce_tile(
-    grid: TileGrid, tile: Tile, sources: Sequence[InputSource], reduce: Reduce, target: str
+    grid: TileGrid,
+    tile: Tile,
+    sources: Sequence[InputSource],
+    reduce: Reduce,
+    lone: LonePoints,
+    target: str,
 ) -> JsonObject:
     """Read the points of a tile, save the arrays they are reduced to, and return the figures."""
-    arrays, figures = reduce(points_of_tile(grid, tile, sources))
+    parts = points_of_tile(grid, tile, sources)
+    arrays, figures = reduce(parts, lone)
     save_arrays(target, arrays)
-    return figures
+    named = []
+    for path, part in parts:
+        alone = lone.among(part["X"], part["Y"])
+        places = np.column_stack([part["X"][alone], part["Y"][alone]])
+        named += [[path, *place] for place in places.tolist()]
+    return {**figures, "lone": named}
+
+
+def _name_lone(points: Sequence[tuple[str, float, float]]) -> list[str]:
+    """Return a message about points that are left out of rasters as they are alone, if any are."""
+    return [
+        f"{count_of(len(points), 'point')} left out of rasters: fewer than two others lie within "
+        f"{LONE_M:g} m, the first at {x:.2f} {y:.2f} of {path}"
+        for path, x, y in points[:1]
+    ]
 
 
 def points_of_tile(grid: TileGrid, tile: Tile, sources: Sequence[InputSource]) -> list[Part]:

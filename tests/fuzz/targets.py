@@ -153,7 +153,9 @@ def cloud(data: bytes) -> str:
     assert Layout.of_file(path).names
     extent = inputs.las_extent(str(path))
     assert (
-        sort_points(str(path), TileGrid(10.0), str(path.with_suffix(".copy")))["count"]
+        sort_points(str(path), TileGrid(10.0), TileGrid(250.0), str(path.with_suffix(".copy")))[
+            "count"
+        ]
         == extent.count
     )
     las.supersede_copc(path)
