@@ -143,19 +143,22 @@ class Context:
         height : (n,) array_like
             Heights above ground in meters; only segments need them.
         """
-        jobs = [(xyz[:, :axes], shares, side, votes) for side, axes, votes in self.scales.values()]
-        means = map_blocks(lambda job: cell_means(*job), jobs, threads)
-        described: dict[str, SegmentContext | LineContext] = {}
         ground = codes.index(GROUND) if GROUND in codes else None
-        for token, code in self.segment_codes.items():
-            assert height is not None
-            # Votes for ground do not count against those of a segment.
-            heights, target = np.asarray(height, np.float64), codes.index(code)
-            described[token] = describe_segments(xyz, shares, heights, target, ground)
-        for token, code in self.line_codes.items():
-            described[token] = describe_lines(xyz, shares, codes.index(code), ground)
-        cells = dict(zip(self.scales, means, strict=True))
-        return CellContext(self.tokens, shares, cells, described)
+
+        def compute(token: str) -> CellMeans | SegmentContext | LineContext:
+            if token in self.line_codes:
+                return describe_lines(xyz, shares, codes.index(self.line_codes[token]), ground)
+            if token in self.segment_codes:
+                assert height is not None
+                # Votes for ground do not count against those of a segment.
+                heights, target = np.asarray(height, np.float64), self.segment_codes[token]
+                return describe_segments(xyz, shares, heights, codes.index(target), ground)
+            side, axes, votes = self.scales[token]
+            return CellMeans(*cell_means(xyz[:, :axes], shares, side, votes))
+
+        around = [token for token in self.tokens if token != OWN]
+        parts = map_blocks(compute, around, threads)
+        return CellContext(self.tokens, shares, dict(zip(around, parts, strict=True)))
 
     def check_codes(self, codes: Sequence[int], dimensions: Sequence[str]) -> None:
         """Raise a ModelError where segments or lines need what is not there.
@@ -189,28 +192,32 @@ class Context:
 
 
 @dataclass(frozen=True, eq=False)
+class CellMeans:
+    """Means over cells and those around each, as the n points of a cloud read them."""
+
+    cell: npt.NDArray  #: (n,) row of each point's cell in the table
+    means: npt.NDArray  #: (cells, classes)
+
+    def columns(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+        """Return the means (b, classes) around some of the points."""
+        return self.means[self.cell[rows]]
+
+
+@dataclass(frozen=True, eq=False)
 class CellContext:
     """Context of the n points of some ground."""
 
     tokens: tuple[str, ...]
     shares: npt.NDArray[np.uint16]  #: (n, classes) of the points themselves
-    #: of the tokens that have cells: (n,) the cell of each point, (cells, classes) the means around
-    #: each cell
-    cells: Mapping[str, tuple[npt.NDArray, npt.NDArray]]
-    #: of the tokens of segments and lines
-    described: Mapping[str, SegmentContext | LineContext]
+    #: of the tokens that look around
+    around: Mapping[str, CellMeans | SegmentContext | LineContext]
 
     def columns(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """Return the columns (b, columns) of some of the points, token by token."""
-        parts: list[npt.NDArray] = []
-        for token in self.tokens:
-            if token == OWN:
-                parts.append(self.shares[rows] / WHOLE)
-            elif token in self.described:
-                parts.append(self.described[token].columns(rows))
-            else:
-                cell, mean = self.cells[token]
-                parts.append(mean[cell[rows]])
+        parts = [
+            self.shares[rows] / WHOLE if token == OWN else self.around[token].columns(rows)
+            for token in self.tokens
+        ]
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
 

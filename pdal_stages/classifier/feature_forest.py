@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
+from ..base.grid import cell_numbers
 from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from ..features import FeatureEngine, FeaturePlan, ShapeBins
 from ..features.engine import FeatureBlock, Run
 from .context_features import OWN, Context
-from .input_dimensions import add_surroundings, take_dimensions
+from .input_dimensions import add_surroundings, required_dimensions, take_dimensions
 from .interface import FOREST, REFINED_FOREST, Estimator, PredictRequest
 from .learner import ContributingLearner, Learner
 
@@ -73,10 +74,9 @@ class CloudFeatures:
     def __init__(self, features: Features, request: PredictRequest) -> None:
         self.features, self._request = features, request
         self._engine: FeatureEngine | None = None
-        names = features.plan.dimensions
-        self._dimensions = add_surroundings(names, request.xyz, request.dimensions, request.threads)
         # An error of these is raised here, before any work.
-        take_dimensions(names, self._dimensions, len(request.xyz), request.rows)
+        names = required_dimensions(features.plan.dimensions)
+        take_dimensions(names, request.dimensions, len(request.xyz), request.rows)
 
     def run(self, rows: npt.NDArray[np.int64] | None, memory_share: float = 1.0) -> Run:
         """Return blocks of some rows (None: all) that take `memory_share` of the memory."""
@@ -94,7 +94,7 @@ class CloudFeatures:
             )
         return self._engine.run(
             rows,
-            dimensions=self._take,
+            dimensions=self._dimensions_around(rows),
             memory_mb=max(request.memory_mb * memory_share, _LEAST_MB),
         )
 
@@ -120,9 +120,33 @@ class CloudFeatures:
         report.beyond_halo.update(computed.beyond_halo)
         report.reach = max(report.reach, computed.reach)
 
-    def _take(self, rows: npt.NDArray[np.int64]) -> dict[str, npt.NDArray]:
-        names = self.features.plan.dimensions
-        return take_dimensions(names, self._dimensions, len(self._request.xyz), rows)
+    def _dimensions_around(
+        self, rows: npt.NDArray[np.int64] | None
+    ) -> Callable[[npt.NDArray[np.int64]], dict[str, npt.NDArray]]:
+        """Return what gives the dimensions at some of these rows (None: all).
+
+        What is computed from the points around is so for these rows alone.
+        """
+        request, names = self._request, self.features.plan.dimensions
+        near = self._slice_around(rows)
+        given = {name: np.asarray(values)[near] for name, values in request.dimensions.items()}
+        xyz = request.xyz[near]
+        known = add_surroundings(names, xyz, given, request.threads)
+
+        def take(some: npt.NDArray[np.int64]) -> dict[str, npt.NDArray]:
+            return take_dimensions(names, known, len(xyz), some - near.start)
+
+        return take
+
+    def _slice_around(self, rows: npt.NDArray[np.int64] | None) -> slice:
+        """Return a part of the cloud that holds rows and all that their dimensions depend on."""
+        grid, xyz = self._request.grid, self._request.xyz
+        if grid is None or rows is None or not len(rows):
+            return slice(0, len(xyz))
+        y, reach = xyz[rows, 1], self.features.plan.reach_of_dimensions
+        first, last = cell_numbers(np.array([y.min() - reach, y.max() + reach]), grid.cell)
+        cells = grid.row_start[np.searchsorted(grid.row_iy, [first, last + 1])]
+        return slice(*grid.cell_start[cells].tolist())
 
 
 @dataclass(frozen=True, eq=False)

@@ -175,9 +175,7 @@ class FeaturePlan:
         ``FeatureEngine.report.beyond_halo``.
         """
         reach = max((n.reach for n in self.neighborhoods if n.reach is not None), default=0.0)
-        reach = max(reach, return_features.reach(self.dimensions))
-        if gap_below.NAME in self.dimensions:
-            reach = max(reach, gap_below.REACH)
+        reach = max(reach, self.reach_of_dimensions)
         if any(n.reach is None for n in self.neighborhoods):
             reach = max(reach, POINTS_HALO)
         for columns in self.layout:
@@ -186,6 +184,12 @@ class FeaturePlan:
                 # POINTS_HALO holds 100; a distance grows with the root of the number of points.
                 reach = max(reach, POINTS_HALO * steps / math.sqrt(100))
         return reach + self.cell
+
+    @property
+    def reach_of_dimensions(self) -> float:
+        """Meters, along x or y, to the farthest point that matters to return features and gaps."""
+        gap = gap_below.REACH if gap_below.NAME in self.dimensions else 0.0
+        return max(gap, return_features.reach(self.dimensions))
 
     @property
     def copt(self) -> bool:

@@ -10,11 +10,11 @@ surroundings: ``MultipleReturn_box2`` over 3 x 3 x 3 cells of 2 m, ``MultipleRet
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..base.threads import map_blocks
 from .cell_means import WHOLE, cell_means
 
 #: What they are made of.
@@ -63,13 +63,20 @@ def return_features(
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
     del number, total
     values: dict[str, npt.NDArray] = {}
-    for scale, (axes, side) in SCALES.items():
-        columns = {flag + scale: number for number, flag in enumerate(FLAGS)}
-        if not wanted & columns.keys():
-            continue
-        cell: Any = slice(None)
-        means: npt.NDArray = (flags > 0).view(np.uint8)
-        if axes:
-            cell, means = cell_means(xyz[:, :axes], flags, side)
-        values |= {name: means[:, k][cell] for name, k in columns.items() if name in wanted}
+    scales = {scale: size for scale, size in SCALES.items() if not wanted.isdisjoint(_names(scale))}
+
+    def compute(scale: str) -> tuple[npt.NDArray | slice, npt.NDArray]:
+        axes, side = scales[scale]
+        if not axes:
+            return slice(None), (flags > 0).view(np.uint8)
+        return cell_means(xyz[:, :axes], flags, side)
+
+    for scale, (cell, means) in zip(scales, map_blocks(compute, [*scales], threads), strict=True):
+        columns = zip(_names(scale), means.T, strict=True)
+        values |= {name: column[cell] for name, column in columns if name in wanted}
     return values
+
+
+def _names(scale: str) -> list[str]:
+    """Return the features of a scale."""
+    return [flag + scale for flag in FLAGS]
