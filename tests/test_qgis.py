@@ -265,7 +265,7 @@ def session(clean_machine, profile):
 @needs_qgis
 def test_algorithms_are_listed(qgis):
     output = qgis("list")
-    names = "classify classifysurvey heights terrainmodels surfaces report train accuracy review corrections objects check"
+    names = "classify classifysurvey heights terrainmodels surfaces report train accuracy review explain corrections objects check"
     for name in names.split():
         assert f"pdalstages:{name}\t" in output
 
@@ -345,6 +345,10 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     assert shown["layers"]["buildings"] == "RuleRenderer"
     output = algorithm("review", INPUTS=cloud, OUTPUT=out / "r.gpkg")
     assert (out / "r.gpkg").is_file(), output
+    place = laspy.read(cloud).xyz[100]
+    asked = {"INPUT": cloud, "POINT": f"{place[0]},{place[1]}", "PAGE": out / "why.html"}
+    output = algorithm("explain", **asked, NOISE=0)
+    assert "WHAT THE MODEL SAW" in output and "computed now" in (out / "why.html").read_text()
     marked = {"BEFORE": cloud, "AFTER": ready_town, "OUTPUT": out / "k.laz", "AROUND": 2}
     output = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
     assert "no patch is marked as checked" in output and not (out / "k.laz").exists()

@@ -109,6 +109,7 @@ class Explanation:
     verdict: Verdict | None  #: None where it is not classified
     #: after the model: what each step is called, and the class after it
     steps: Sequence[tuple[str, int]]
-    #: dimensions of the file that the stages compute, and whether they get the same
-    same: Mapping[str, bool]
+    #: dimensions of the file that the stages compute: the file's value, that of now, and whether
+    #: both are the same but for rounding
+    compared: Mapping[str, tuple[float, float, bool]]
     notes: Sequence[str]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from ..base.asprs import class_name
 from ..base.messages import one_line
@@ -15,6 +16,9 @@ from .trace_points import SURROUNDINGS
 _OF_LAST = 4
 #: Inputs that are shown of the first pass.
 _OF_FIRST = 10
+#: Given ground that stands higher above the lowest point near, in meters, is doubted: that high
+#: are hedges and low roofs, and not the ground on slopes of up to 45 %.
+_HIGH_M = 2.25
 #: Width of the column of names.
 _NAME = 16
 #: Width of a number.
@@ -59,29 +63,34 @@ def _class(code: int) -> str:
 
 def _differences(told: Explanation) -> list[str]:
     """Return what differs from the run that gave the file its class."""
-    heights, reliability = (told.same.get(n) for n in ("HeightAboveGround", "Reliability"))
-    if told.in_file == told.computed and heights is not False and reliability is not False:
+    known = {name: same for name, (_, _, same) in told.compared.items()}
+    if told.in_file == told.computed and all(known.values()):
         return []
+    out = [
+        f"{name} is {before:.2f} in the file, {now:.2f} now"
+        for name, (before, now, _) in told.compared.items()
+    ]
     if told.point.checked:
-        return ["the file differs: a person set or confirmed the class (Checked is 1)"]
-    if heights is False:
-        texts = [
-            "the file differs from its height on (HeightAboveGround): another ground, by --ground,",
-            "edited classes 2, 9, 11, options of the ground filter, other points, or a version",
-        ]
-    elif reliability is False:
-        texts = [
-            "the file differs from its Reliability on, its height is the same: another --model,",
-            "another version of it, or noise and options of the model that are not given here",
-        ]
-    elif heights and reliability:
-        texts = [
-            "the file differs in the class alone: it was changed after the model, by hand or by an",
-            "option that is not given here (--keep-sure, --vegetation-heights, --bridges, ...)",
-        ]
-    else:
-        texts = ["the file differs; it has no HeightAboveGround and Reliability that tell where"]
-    return texts
+        out.append("so a person set or confirmed the class (Checked is 1)")
+    elif known.get("HeightAboveGround") is False:
+        out.append(
+            "so the ground is another: --ground, edited classes 2, 9 or 11, options of the ground "
+            "filter,\nother points around, or another version of the filter"
+        )
+    elif known.get("Reliability") is False:
+        out.append(
+            "so the ground is the same, and the model is another: --model, a version of it, or "
+            "options of its stage"
+        )
+    elif len(known) == 2:
+        out.append(
+            "so the model said the same, and the class was changed afterwards: by hand, or by an "
+            "option\nthat is not given here (--keep-sure, --vegetation-heights, --bridges, "
+            "--polygons, --where)"
+        )
+    elif not told.kept:
+        out.append("the file has no HeightAboveGround and Reliability that would tell where")
+    return ["", "WHAT DIFFERS", *(f"  {line}" for text in out for line in text.split("\n"))]
 
 
 def _noise(told: Explanation) -> str:
@@ -106,9 +115,13 @@ def _ground(ground: GroundSteps) -> list[str]:
     name = f"its {ground.cell:g} m cell"
     out = [_row(name, f"lowest point: {_relative(ground.lowest)}")]
     if ground.is_given:
-        near = f"lowest point within 5 m: {_relative(ground.lowest_near)}"
-        given = f"in the cell (classes 2, 9, 11): {_relative(ground.given)}; {near}"
+        given = f"mean of classes 2, 9, 11 there: {_relative(ground.given)}"
         out.append(_row("--ground given", given))
+        high = (ground.given or 0.0) - (ground.lowest_near or 0.0)
+        out.append(_row("lowest near", f"within 5 m: {_relative(ground.lowest_near)}"))
+        if ground.given is not None and high > _HIGH_M:
+            text = f"given ground is {high:.2f} m above the lowest point near: was a class edited?"
+            out.append(_row("look", text))
     elif ground.lowest is not None:
         out += _cell_steps(ground, ground.lowest)
     away = f"{abs(ground.above_provisional):.2f} m from the surface through ground cells"
@@ -152,12 +165,8 @@ def _verdict(verdict: Verdict) -> list[str]:
     """Return the probabilities of each pass, and the inputs that decided."""
     codes, passes = list(verdict.classes), verdict.passes
     names = {code: _short(code) for code in codes}
-    out = [
-        _row(
-            f"{one_line(verdict.model)}"[-_NAME:],
-            "".join(f"{n:>{_NUMBER}}" for n in names.values()),
-        )
-    ]
+    model = one_line(Path(verdict.model).name)[-_NAME:]
+    out = [_row(model, "".join(f"{name:>{_NUMBER}}" for name in names.values()))]
     shares = {f"pass {n}": each.probabilities for n, each in enumerate(passes, 1)}
     for name, share in {**shares, "in the end": verdict.probabilities}.items():
         out.append(_row(name, "".join(f"{share.get(code, 0.0):>{_NUMBER}.2f}" for code in codes)))
@@ -169,7 +178,7 @@ def _verdict(verdict: Verdict) -> list[str]:
     pair = verdict.winner, verdict.rival
     ranges = any(each.below for single in passes for each in single.inputs)
     first, second = (class_name(code) for code in pair)
-    about = "and the share of the training's points of either class with lower values."
+    about = "and which share of the training's points of either class has lower values."
     if not ranges:
         about = "(The model file has no percentiles of its training to compare it with.)"
     titles = [*map(_short, pair), "value", *(map(_short, pair) if ranges else ())]
@@ -204,14 +213,12 @@ def _rows(
     chosen += [each for each in ranked if each.name == SURROUNDINGS]
     rest = [sum(e.added.get(c, 0.0) for e in ranked if e not in chosen) for c in pair]
     shares = [f"{single.start.get(code, 0.0):.3f}" for code in pair]
-    out = [_columns(shares, ranges, f"pass {number} before any input")]
+    out = [_columns(shares, ranges, f"where pass {number} starts")]
     for each in sorted(chosen, key=lambda each: -weight(each)):
         words, _ = words_for(each.name)
         added = [f"{each.added.get(code, 0.0):+.3f}" for code in pair]
         if each.value is None:
-            out.append(
-                _columns(added, ranges, f"surroundings: pass {number - 1}, of it and around")
-            )
+            out.append(_columns(added, ranges, f"surroundings: pass {number - 1}, here and around"))
             continue
         below = [f"{100 * each.below[c]:.0f} %" if c in each.below else "" for c in pair]
         out.append(_columns([*added, show_value(each), *(below if ranges else ())], ranges, words))

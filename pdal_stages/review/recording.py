@@ -133,7 +133,8 @@ class Recording:
             each.update_context(outside=_OUTSIDE)
         part, known = SomeRows(seen, rows), {_OUTSIDE: outside}
         self.seen = run_stages(ours[first:], part, wkt, known, self._keep_classes)
-        self.notes = [text for text in pipeline.messages if "points/m2" not in text]
+        texts = [*pipeline.expanded.warnings, *pipeline.messages]
+        self.notes = [text for text in texts if "points/m2" not in text]
 
     def _keep(self, name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
         if not self.pieces or name in self.pieces[-1]:  # each piece begins with the same step

@@ -60,11 +60,11 @@ def trace_point(recording: Recording, place: int, distance_m: float) -> Explanat
         (stage.type, code)
         for stage, code in zip(stages[model_at + 1 :], codes[model_at + 2 :], strict=True)
     ]
-    same = {}
+    compared = {}
     for name, step in _COMPARED.items():
         if name in columns and name in recording.seen and not kept:
-            gap = abs(float(columns[name][row]) - float(recording.seen[name][at]))
-            same[name] = gap <= 0.51 * step + 1e-4
+            before, now = float(columns[name][row]), float(recording.seen[name][at])
+            compared[name] = before, now, abs(before - now) <= 0.51 * step + 1e-4
     return Explanation(
         _found(recording, row, distance_m),
         codes[0],
@@ -74,7 +74,7 @@ def trace_point(recording: Recording, place: int, distance_m: float) -> Explanat
         _ground(recording, row, next((s for s in stages if isinstance(s, HagMorphological)), None)),
         verdict,
         steps,
-        same,
+        compared,
         recording.notes,
     )
 

@@ -1,5 +1,6 @@
 """The algorithms: which commands and pipelines they run, and what of it comes onto the map."""
 
+import html
 import json
 import os
 
@@ -11,6 +12,7 @@ from qgis.core import (
     QgsProcessingParameterEnum,
     QgsProcessingParameterFolderDestination,
     QgsProcessingParameterNumber,
+    QgsProcessingParameterPoint,
     QgsProcessingParameterRasterDestination,
     QgsProject,
 )
@@ -526,6 +528,43 @@ class Review(_Showing):
         return {"OUTPUT": target}
 
 
+class Explain(_Classifying):
+    """Tell why a point has its class."""
+
+    key, title, command = "explain", "Why: the reasons for the class of a point", "explain"
+    about = (
+        "Tells of the point nearest to a place on the map what the ground filter made of it, which "
+        "inputs of the model spoke for its class and against it, what came after, and what differs "
+        "from the run that classified the file. Give the options of that run. The text is in the "
+        "log and under Processing > Results Viewer."
+    )
+    listed = ("noise", "bridges", "vegetation_heights", "keep_sure")
+    handled = ("cloud", "place", "points", "crs", "json", "model")
+
+    def initAlgorithm(self, configuration=None):
+        self.add_file("INPUT", "Point cloud", self.help_of("cloud"))
+        point = QgsProcessingParameterPoint("POINT", "Place")
+        point.setHelp(self.help_of("place"))
+        self.addParameter(point)
+        self.add_model()
+        self.add_declared()
+        self.add_destination("PAGE", "Reasons", files=_PAGES)
+        self.addOutput(QgsProcessingOutputHtml("HTML", "Reasons"))
+        self.addOutput(QgsProcessingOutputString("REASONS", "Reasons"))
+
+    def processAlgorithm(self, parameters, context, feedback):
+        page = self.destination(parameters, "PAGE", context)
+        point = self.parameterAsPoint(parameters, "POINT", context)
+        crs = self.parameterAsPointCrs(parameters, "POINT", context)
+        chosen = [*self.model(parameters, context), *self.arguments(parameters, context)]
+        chosen += [f"--crs={crs.authid() or crs.toWkt()}"] if crs.isValid() else []
+        place = [self.parameterAsFile(parameters, "INPUT", context), *map(repr, point)]
+        text = self.execute(["explain", *chosen, *place], feedback)
+        with open(page, "w", encoding="utf-8") as file:
+            file.write(f'<meta charset="utf-8"><pre>{html.escape(text)}</pre>')
+        return {"PAGE": page, "HTML": page, "REASONS": text}
+
+
 class Corrections(_Showing):
     """Mark points that a person has checked, for training."""
 
@@ -567,6 +606,7 @@ ALGORITHMS = (
     Train,
     Accuracy,
     Review,
+    Explain,
     Corrections,
     Objects,
 )
