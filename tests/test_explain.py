@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.asprs import class_name
+from pdal_stages.base.las_points import columns_of_files
 from pdal_stages.classifier.training_percentiles import PERCENTILES
 from pdal_stages.cli import main
+from pdal_stages.review.recording import Surroundings
 from pdal_stages.review.trace_points import SURROUNDINGS, share_below
 
 pytestmark = pytest.mark.pdal
@@ -229,3 +231,22 @@ def test_shares_below_are_those_of_the_percentiles():
     assert [share_below(v, row) for v in row] == [p / 100 for p in PERCENTILES]
     assert share_below(1.5, row) == pytest.approx(0.15) and share_below(9.0, row) == 0.995
     assert share_below(0.0, [0.0] * 7) == 0.5 and share_below(1.0, [0.0] * 6 + [1.0]) == 0.99
+
+
+def test_every_dimension_of_the_surroundings_can_be_read(city, tmp_path):
+    """Whichever a stage asks for: of LAZ 1.4 each is decoded by itself, and else is zero."""
+    las = laspy.read(city)
+    las.user_data[:] = np.arange(len(las)) % 256
+    las.write(tmp_path / "one.laz")
+    las.x = las.x + 50
+    las.write(tmp_path / "two.laz")
+    files = [str(tmp_path / f"{name}.laz") for name in ("one", "two")]
+    whole = columns_of_files(files)
+    box = [770_600, 6_277_500, 770_660, 6_277_520]
+    around = Surroundings(files, box)
+    x, y = whole["X"], whole["Y"]
+    inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
+    assert 0 < inside.sum() < len(x) and {*around} == {*whole}
+    for name in whole:
+        assert np.array_equal(around[name], whole[name][inside]), name
+    assert around["UserData"].any()

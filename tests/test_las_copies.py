@@ -184,6 +184,16 @@ def test_dimensions_of_the_run_are_kept_where_they_are_not_written(tmp_path, nam
         assert np.array_equal(laspy.read(tmp_path / "o.las")[name], values)
 
 
+def test_a_name_made_of_axes_is_no_axis(tmp_path):
+    source = with_dimension(tmp_path / "a.las", "XY", "u2", np.arange(400))
+    for more in ([], ["--tile", "100", "--workers", "0"]):
+        arguments = [str(source), str(tmp_path / "o.las"), "--where", "XY > 300", *more]
+        assert main(["classify", *arguments]) == 0
+        las = laspy.read(tmp_path / "o.las")
+        assert np.array_equal(las["XY"], np.arange(400))
+        assert not np.asarray(las.classification)[:301].any()
+
+
 def test_our_dimension_is_replaced_in_place(tmp_path):
     source = with_dimension(tmp_path / "a.las", "Reliability", "f8", np.full(400, 9.0))
     assert main(["classify", str(source), str(tmp_path / "o.las")]) == 0

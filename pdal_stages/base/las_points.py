@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from .errors import DimensionError, StageError
 from .las import POINT_BYTES, POINTWISE, LasHeader, laszip_record, read_header, records_of
 
+#: Dimensions that have a scale and an offset in the header.
+AXES = ("X", "Y", "Z")
 #: Points read at a time: 30 to 70 MB as LAS stores them.
 PART = 1_000_000
 #: Bytes of a description of extra bytes.
@@ -225,7 +227,7 @@ class Layout:
 
     def type_of(self, name: str) -> np.dtype:
         """Return the type of a dimension's values."""
-        if name in "XYZ":
+        if name in AXES:
             return np.dtype(float)
         if name in self.extra_by_name:
             each = self.extra_by_name[name]
@@ -249,7 +251,7 @@ class Layout:
         if name not in (self.dtype.names or ()) or not name[0].isupper():
             raise KeyError(name)
         values = records[name]
-        if name in "XYZ":
+        if name in AXES:
             return self.scaled(name, values)
         if name == "ScanAngleRank" and not self.is_old:
             values = values * _ANGLE_STEP
@@ -257,7 +259,7 @@ class Layout:
 
     def scaled(self, axis: str, steps: NDArray) -> NDArray[np.float64]:
         """Return coordinates (n,) along X, Y or Z of the whole numbers that records hold."""
-        number = "XYZ".index(axis)
+        number = AXES.index(axis)
         return steps * self.header.scales[number] + self.header.offsets[number]
 
     def put(self, records: NDArray, name: str, values: NDArray) -> None:
@@ -272,8 +274,8 @@ class Layout:
             mask = np.uint8(((1 << count) - 1) << low)
             new = np.asarray(values).astype(np.uint8) << np.uint8(low) & mask
             records[field] = records[field] & ~mask | new
-        elif name in "XYZ":
-            axis = "XYZ".index(name)
+        elif name in AXES:
+            axis = AXES.index(name)
             steps = (values - self.header.offsets[axis]) / self.header.scales[axis]
             records[name] = np.rint(steps)
         elif name == "ScanAngleRank" and not self.is_old:
@@ -412,7 +414,7 @@ class LasColumns(Mapping[str, NDArray]):
             wanted = USUAL if name in USUAL and not self._read.keys() & {*USUAL} else (name,)
             self.load([each for each in wanted if each in self.layout.names])
         values = self._read[name]
-        return self.layout.scaled(name, values) if name in "XYZ" else values
+        return self.layout.scaled(name, values) if name in AXES else values
 
     def load(self, names: Sequence[str]) -> None:
         """Read dimensions, all in one pass."""
@@ -421,7 +423,7 @@ class LasColumns(Mapping[str, NDArray]):
         new = {name: np.empty(layout.header.count, kind) for name, kind in kinds.items()}
         for records in read_records(self.path, layout, only=names):
             for name, values in new.items():
-                part = records[name] if name in "XYZ" else layout.column(records, name)
+                part = records[name] if name in AXES else layout.column(records, name)
                 values[at : at + len(records)] = part
             at += len(records)
         self._read |= new

@@ -69,7 +69,7 @@ def explain_points(
         xy = np.array([places[number][:2] for number in members])
         reach = reach_m / unit
         box = [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)]
-        around = Surroundings(files, box, f"{request} {request.loaded.plan.dimensions}")
+        around = Surroundings(files, box)
         found = [around.nearest(places[number], unit) for number in members]
         rows = np.array([row for row, _ in found])
         recording = Recording(around, request, reference, rows)

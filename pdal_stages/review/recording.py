@@ -6,7 +6,7 @@ model computes the points in question, and what these depend on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,30 +39,64 @@ _FARTHEST_M = 2.0
 _FARTHEST_SPACINGS = 3.0
 
 
-class Surroundings:
-    """Points of files within a box."""
+class Surroundings(Mapping[str, NDArray]):
+    """The dimensions of the points of files within a box, each read when it is asked for.
 
-    def __init__(self, files: Sequence[str], box: Sequence[float], mentioned: str) -> None:
-        """Read the dimensions that every run needs, and those that are mentioned in a text."""
-        self.files = files
+    Those that every run needs are read in the first pass; another one takes a pass of its own.
+    """
+
+    def __init__(self, files: Sequence[str], box: Sequence[float]) -> None:
         west, south, east, north = box
-        parts: list[tuple[Layout, NDArray]] = []
-        places = [np.zeros((2, 0), np.int64)]
-        for index, path in enumerate(files):
-            layout, at = Layout.of_file(path), 0
+        self.files = files
+        self._rows: dict[int, NDArray[np.int64]] = {}  #: of files that have points in the box
+        self._layouts = {n: Layout.of_file(path) for n, path in enumerate(files)}
+        for index, layout in list(self._layouts.items()):
             x0, y0, x1, y1 = layout.header.box
             if x0 > east or x1 < west or y0 > north or y1 < south:
-                continue
-            names = [n for n in layout.names if n in _READ or n.lower() in mentioned.lower()]
-            for records in read_records(path, layout, only=names):
+                del self._layouts[index]
+        first = []
+        for index, layout in self._layouts.items():
+            names, rows, at = [n for n in layout.names if n in _READ], [np.zeros(0, np.int64)], 0
+            for records in read_records(files[index], layout, only=names):
                 x, y = (layout.column(records, axis) for axis in "XY")
-                rows = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
-                parts.append((layout, records[rows] if len(rows) < len(records) else records))
-                places.append(np.stack([np.full(len(rows), index), rows + at]))
+                inside = (x >= west) & (x <= east) & (y >= south) & (y <= north)
+                rows.append(at + np.flatnonzero(inside))
+                first.append((layout, records if inside.all() else records[inside]))
                 at += len(records)
-        self.columns = RecordColumns(parts)
+            self._rows[index] = np.concatenate(rows)
+        self._first = RecordColumns(first)
+        self._more: dict[str, NDArray] = {}
+        counts = [len(rows) for rows in self._rows.values()]
         #: (n,) each: number of the file, and of the point in it
-        self.file, self.number = np.concatenate(places, axis=1)
+        self.file = np.repeat(np.fromiter(self._rows, np.int64), counts)
+        self.number = np.concatenate([np.zeros(0, np.int64), *self._rows.values()])
+
+    def __getitem__(self, name: str) -> NDArray:
+        """Return a dimension (n,)."""
+        if name in _READ or name not in self:
+            return self._first[name]
+        if name not in self._more:
+            parts: list[tuple[Layout, NDArray]] = []
+            for index, layout in self._layouts.items():
+                at, rows = 0, self._rows[index]
+                for records in read_records(self.files[index], layout, only=[name]):
+                    low, high = np.searchsorted(rows, (at, at + len(records)))
+                    parts.append((layout, records[rows[low:high] - at]))
+                    at += len(records)
+            self._more[name] = RecordColumns(parts)[name]
+        return self._more[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self._first)
+
+    def __len__(self) -> int:
+        """Return the number of dimensions."""
+        return len(self._first)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a dimension, without reading it."""
+        return name in self._first
 
     def nearest(self, place: AskedPlace, unit: float) -> tuple[int, float]:
         """Return the row of the nearest point and its distance in meters; StageError if far.
@@ -71,11 +105,11 @@ class Surroundings:
         """
         found, asked = "no point at all", np.array([v for v in place[:3] if v is not None])
         if len(self.number):
-            xyz = np.column_stack([self.columns[axis] for axis in "XYZ"])
+            xyz = np.column_stack([self[axis] for axis in "XYZ"])
             away = unit * np.sqrt(((xyz[:, : len(asked)] - asked) ** 2).sum(axis=1))
             inside = np.flatnonzero(away <= place.doubtful_m)
-            if len(inside) and "Reliability" in self.columns:
-                row = int(inside[np.argmin(self.columns["Reliability"][inside])])
+            if len(inside) and "Reliability" in self:
+                row = int(inside[np.argmin(self["Reliability"][inside])])
                 return row, float(away[row])
             row, near = int(np.argmin(away)), away < 50.0
             spacing = 1.0 / np.sqrt(density(xyz[near] * unit)) if near.any() else 0.0
@@ -116,7 +150,7 @@ class Recording:
         for each in ours:
             each.update_context(observer=observer)
         first = next(n for n, each in enumerate(ours) if isinstance(each.stage, ApplyModel))
-        columns, wkt = self.around.columns, self.reference.wkt
+        columns, wkt = self.around, self.reference.wkt
         known = selection(self.request.where, columns)
         seen = run_stages(ours[:first], columns, wkt, known, self._keep_classes)
         reach = (sum(each.stage.halo_m() for each in ours[first:]) + _MARGIN_M) / unit

@@ -45,7 +45,7 @@ _COMPARED = {"HeightAboveGround": 1 / 32, "Reliability": 1 / 64}
 def trace_point(recording: Recording, place: int, distance_m: float) -> Explanation:
     """Return how a point came to its class; `place` is its number among those of the recording."""
     row, at = int(recording.rows[place]), int(recording.rows_seen[place])
-    columns = recording.around.columns
+    columns = recording.around
     stages = [each.stage for each in recording.stages]
     model_at = next(n for n, stage in enumerate(stages) if isinstance(stage, ApplyModel))
     model_stage = stages[model_at]
@@ -83,8 +83,8 @@ def _found(recording: Recording, row: int, distance_m: float) -> FoundPoint:
     """Return what the file has of a point."""
     around = recording.around
     names = ("X", "Y", "Z", "ReturnNumber", "NumberOfReturns")
-    x, y, z, number, returns = (around.columns[name][row].item() for name in names)
-    checked = "Checked" in around.columns and bool(around.columns["Checked"][row])
+    x, y, z, number, returns = (around[name][row].item() for name in names)
+    checked = "Checked" in around and bool(around["Checked"][row])
     file = around.files[around.file[row]]
     return FoundPoint(file, int(around.number[row]), x, y, z, distance_m, number, returns, checked)
 
@@ -107,7 +107,7 @@ def _axes(recording: Recording, rows: NDArray | slice) -> list[NDArray[np.float6
     """Return x, y and z (m,) of rows in meters, as stages see them."""
     units = recording.reference.units
     scales = (units.horizontal, units.horizontal, units.vertical)
-    columns = recording.around.columns
+    columns = recording.around
     return [
         np.rint(columns[axis][rows] * 1e6) / 1e6 * scale
         for axis, scale in zip("XYZ", scales, strict=True)
@@ -120,13 +120,13 @@ def _noise(recording: Recording, row: int, stage: DetachedNoise | None) -> Noise
         return None
     x, y, _ = _axes(recording, slice(None))
     near = np.flatnonzero(np.maximum(np.abs(x - x[row]), np.abs(y - y[row])) <= NOISE_REACH + 1.0)
-    some = SomeRows(recording.around.columns, near)
+    some = SomeRows(recording.around, near)
     near = near[~Points(some, recording.reference.wkt).chosen(stage.ignore)]
     if row not in near:
         return None
     near_x, near_y, near_z = _axes(recording, near)
     state = find_detached(near_x, near_y, near_z, stage.cluster, stage.gap)
-    before = recording.around.columns["Classification"][row]
+    before = recording.around["Classification"][row]
     number = next(n for n, each in enumerate(recording.stages) if each.stage is stage)
     after = recording.classes[number][np.flatnonzero(recording.rows == row)[0]]
     return Noise(int(after) if after != before else 0, int(state[np.searchsorted(near, row)]))
