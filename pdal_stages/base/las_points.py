@@ -419,7 +419,7 @@ class LasColumns(Mapping[str, NDArray]):
     def load(self, names: Sequence[str]) -> None:
         """Read dimensions, all in one pass."""
         layout, at = self.layout, 0
-        kinds = {n: layout.dtype[n] if n in "XYZ" else layout.type_of(n) for n in names}
+        kinds = {n: layout.dtype[n] if n in AXES else layout.type_of(n) for n in names}
         new = {name: np.empty(layout.header.count, kind) for name, kind in kinds.items()}
         for records in read_records(self.path, layout, only=names):
             for name, values in new.items():
