@@ -5,11 +5,15 @@ import json
 import laspy
 import numpy as np
 import pytest
+from alsnet_scenes import model_of, random_net
 
 from pdal_stages.base.asprs import class_name
+from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_points import columns_of_files
 from pdal_stages.classifier.training_percentiles import PERCENTILES
 from pdal_stages.cli import main
+from pdal_stages.review.explanation import AskedPlace
+from pdal_stages.review.places import read_places
 from pdal_stages.review.recording import Surroundings
 from pdal_stages.review.trace_points import SURROUNDINGS, share_below
 
@@ -163,6 +167,42 @@ def test_noise_where_and_what_is_left_out(city, explain, tmp_path):
     assert "outside --where Z > 1000" in text and each["computed"] == each["in_file"]
 
 
+# ---- other models --------------------------------------------------------------------------------
+
+
+def test_a_network_gives_probabilities_and_says_that_it_gives_no_reasons(city, explain, tmp_path):
+    model_of(random_net(("Z",), seed=4)).save(tmp_path / "net.model")
+    words = ["--model", tmp_path / "net.model", "--no-noise"]
+    out = tmp_path / "out.laz"
+    assert main(["classify", str(city), str(out), *map(str, words), "--dimensions", "all"]) == 0
+    las, places = places_of(out, [2000])
+    text, (each,) = explain(out, *places[0], *words)
+    assert "a network, or another learner than a forest, gives none" in text
+    assert each["computed"] == each["in_file"] == las.classification[2000]
+    assert each["noise"] is None and "not looked for (--no-noise)" in text
+    assert each["ground"] is None and not each["verdict"]["passes"]
+    assert sum(each["verdict"]["probabilities"].values()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_model_with_percentiles_shows_where_values_lie(city, explain, tmp_path, run):
+    """Of a model on top of the shipped one, whose file has them: at a roof's median half lie below."""
+    las = laspy.read(city)
+    las.add_extra_dim(laspy.ExtraBytesParams("Checked", "uint8"))
+    chosen = np.isin(las.classification, (5, 6)) & (np.arange(len(las)) % 40 == 0)
+    las["Checked"] = chosen.astype(np.uint8)
+    las.write(tmp_path / "checked.laz")
+    words = ["--base", "standard", "--model", tmp_path / "mine.model"]
+    code, _, err = run("train", tmp_path / "checked.laz", *words)
+    assert code == 0, err
+    las, places = places_of(city, np.flatnonzero(las.classification == 6)[:1])
+    text, (each,) = explain(city, *places[0], "--model", tmp_path / "mine.model")
+    last = each["verdict"]["passes"][-1]
+    shares = [entry["below"] for entry in last["inputs"][:-1]]
+    assert all(set(share) == {"5", "6"} for share in shares) and len(each["verdict"]["passes"]) == 3
+    assert all(0.0 <= value <= 1.0 for share in shares for value in share.values())
+    assert "which share of the training's points" in text and " %" in text
+
+
 # ---- files and places ----------------------------------------------------------------------------
 
 
@@ -216,6 +256,19 @@ def test_places_of_vector_files_and_other_reference_systems(city, explain, tmp_p
 def test_errors(city, run, words, text):
     code, out, err = run("explain", city, *words)
     assert code == 1 and text in err and not out
+
+
+def test_rows_that_are_no_places_are_named(tmp_path):
+    (tmp_path / "p.csv").write_text("x,y,z\n1,2,\n3,4,5\n")
+    assert read_places("", [], str(tmp_path / "p.csv")) == [AskedPlace(1, 2), AskedPlace(3, 4, 5)]
+    for text in ("1,2\n3,4\n", "x,y\n1,2\n3,4\n"):
+        (tmp_path / "p.csv").write_text(text)
+        assert read_places("", [], str(tmp_path / "p.csv")) == [AskedPlace(1, 2), AskedPlace(3, 4)]
+    (tmp_path / "p.csv").write_text("1,2\nhere,there\n")
+    with pytest.raises(StageError, match="point 2 is not x,y or x,y,z"):
+        read_places("", [], str(tmp_path / "p.csv"))
+    with pytest.raises(StageError, match="cannot be read"):
+        read_places("", [], str(tmp_path / "none.csv"))
 
 
 def test_a_cloud_without_given_ground(city, run, tmp_path):

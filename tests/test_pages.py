@@ -25,7 +25,7 @@ ELSEWHERE = re.compile(r"benchmarks/|--scheduler|plugin --install|warmup|drivers
 #: What makes a training quick: fewer samples and trees.
 QUICK = [f"--writers.classifiermodel.{o}" for o in ("count=60", "trees=3", "neighborhoods=k10")]
 PAGES = {
-    "README.md": 6,
+    "README.md": 7,
     "docs/deliverables.md": 2,
     "docs/first-result.md": 6,
     "docs/how-to.md": 7,
@@ -72,6 +72,7 @@ def folder(town, tmp_path, monkeypatch):
     las.write("raw.laz")
     for number, part in enumerate((east, ~east)):
         las[part].write(f"survey/{number}.laz")
+    Path("doubts.csv").write_text(f"{np.median(las.x)},{np.median(las.y)}\n")
     Path("control.csv").write_text(f"{np.median(las.x)},{np.median(las.y)},0\n")
     laspy.convert(las, point_format_id=1, file_version="1.2").write("old.laz")
     (x, y), where = (

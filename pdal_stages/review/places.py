@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from ..base.errors import OptionError, StageError
 from ..base.vector import reading, vector
@@ -45,18 +46,13 @@ def read_places(
 
 def _read_csv(path: str) -> list[AskedPlace]:
     """Return the first two or three numbers of each row; the first row may be a heading."""
-    places = []
     with reading(path, "the points cannot be read", "Give rows of x,y or x,y,z") as name:
-        with open(name, newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row]
-        for number, row in enumerate(rows):
-            try:
-                x, y, *z = (float(text) for text in row[:3] if text.strip())
-                places.append(AskedPlace(x, y, *z))
-            except ValueError:
-                if number:
-                    raise StageError(f"row {number + 1} is not x,y or x,y,z: {row}") from None
-    return places
+        rows = np.genfromtxt(name, delimiter=",", encoding="utf-8-sig", ndmin=2)[:, :3]
+    rows = rows[int(len(rows) and np.isnan(rows[0, :2]).any()) :]
+    if np.isnan(rows[:, :2]).any():
+        number = int(np.argmax(np.isnan(rows[:, :2]).any(axis=1)))
+        raise StageError(f"point {number + 1} is not x,y or x,y,z", where=path)
+    return [AskedPlace(x, y, *(v for v in z if v == v)) for x, y, *z in rows.tolist()]
 
 
 def _read_vector(path: str) -> tuple[list[AskedPlace], str]:
