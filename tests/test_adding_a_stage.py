@@ -37,7 +37,9 @@ def in_this_package(folder: Path) -> None:
             link = folder / path.relative_to(ROOT)
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(path)
-    (folder / "pdal_stages" / "stages" / "heightband.py").write_text(block("python"))
+    module = folder / "pdal_stages" / "stages" / "heightband.py"
+    module.unlink(missing_ok=True)  # else the link to one that is there would be written through
+    module.write_text(block("python"))
 
 
 def in_another_package(folder: Path) -> None:

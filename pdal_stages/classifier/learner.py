@@ -1,6 +1,7 @@
 """Learners on features: what a forest is to this package, and another may be.
 
-``KINDS["boosting"] = FeatureKind("boosting", Booster)`` registers one for this process, the entry
+``KINDS["boosting"] = FeatureKind("boosting", lambda: Booster)`` (``KINDS`` of :mod:`.interface`,
+``FeatureKind`` of :mod:`.feature_kind`) registers one for this process, the entry
 point ``pdal_stages.kinds`` for all. It then gets samples, features, passes with context,
 cross-validation and calibration as the forest does, and is applied in tiles like it.
 """
