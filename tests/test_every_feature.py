@@ -82,3 +82,27 @@ def test_a_registered_feature_is_what_its_reference_says(feature, engine, pulls,
         else:
             rel = 2e-3 if neighborhood.kind in ADAPTIVE else 2e-4
             assert values == pytest.approx(expected, rel=rel, abs=1e-5), token
+
+
+#: Features that are not shares of eigenvalues, which alone are 0 of fewer than three points.
+OF_FEW = {
+    "SurfaceVariation", "Density", "HeightRange", "HeightStd", "HeightAboveLowest", "Radius",
+    *oracle.SURFACES,
+}  # fmt: skip
+
+
+def test_of_fewer_than_three_points_eigen_features_are_zero():
+    """One, two and three points within 1.5 m; those of the third have values."""
+    xyz = np.array(
+        [[0, 0, 0], [50, 0, 0], [50.5, 0, 0.2], [100, 0, 0], [101, 0, 0.3], [100, 1, 0.5]]
+    )
+    names = [f.name for f in FEATURES if f.group != "shapes" and f.name not in SHAPES]
+    names = [name for name in names if name.partition("_")[0] not in SHAPES]
+    zero = [name for name in names if name not in OF_FEW]
+    engine = FeatureEngine(xyz, FeaturePlan.parse(("c1.5", "s1.5"), names), threads=1).fit()
+    few, three = engine.table(np.array([0, 1, 2])), engine.table(np.array([3]))
+    assert zero and "Linearity" in zero
+    for name in zero:
+        for suffix in ("c1_5", "s1_5"):
+            assert not few[f"{name}_{suffix}"].any(), name
+    assert any(three[f"{name}_s1_5"].any() for name in zero)

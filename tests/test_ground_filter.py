@@ -173,6 +173,13 @@ def test_planes_equal_the_slow_reference(slope):
 HOLES = {"basement": (12.5, 7.5, 3.5), "pit": (6.0, 6.0, 8.0), "canal": (np.inf, 4.0, 3.0)}
 
 
+def test_points_are_ground_within_a_distance_that_grows_with_the_slope():
+    """By hand: 0.4 m, and 1.25 m more for each meter that the surface rises in one."""
+    height, slope = np.array([0.4, 0.41, -0.4, -0.41, 0.65, 0.66]), np.array([0, 0, 0, 0, 0.2, 0.2])
+    found = FilterOptions().is_ground(np.ones(6, bool), height, slope)
+    assert found.tolist() == [True, False, True, False, True, False]
+
+
 def share_kept(path, hole, clip=np.inf):
     """Return the share of the ground more than 2 m off a hole that is still ground when the hole is dug.
 
