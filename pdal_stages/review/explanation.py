@@ -93,6 +93,8 @@ class Verdict:
     rival: int  #: the class of the file where the model has it, else the second
     passes: Sequence[PassTrace]  #: empty of a network
     stands_for_it_m: float | None  #: how far away the point of its voxel is that is computed
+    #: classes that the last pass found likely and the model then excluded: what lies on no line
+    excluded: Sequence[int]
     limit: float | None  #: least reliability that keeps the class
 
 

@@ -186,17 +186,22 @@ def _verdict(recording: Recording, stage: ApplyModel, place: int, in_file: int) 
     shares = {code: float(recording.seen[f"Probability_{code}"][at]) for code in names}
     order = sorted(names, key=lambda code: -shares[code])
     rival = in_file if in_file in names and in_file != order[0] else order[1]
-    passes, stands = [], None
-    for number in range(len(model.passes)):
-        for each in recording.inputs:
-            if each.number == number and (found := np.flatnonzero(each.rows == at)).size:
-                passes.append(_trace_pass(model, each, int(found[0])))
-                own = np.column_stack(_axes(recording, np.array([row])))
-                away = float(np.linalg.norm(each.xyz[found[0]] - own))
-                stands = away if away > 1e-6 else None
+    by_pass: dict[int, PassTrace] = {}
+    stands = None
+    for each in recording.inputs:
+        if each.number not in by_pass and (found := np.flatnonzero(each.rows == at)).size:
+            by_pass[each.number] = _trace_pass(model, each, int(found[0]))
+            own = np.column_stack(_axes(recording, np.array([row])))
+            away = float(np.linalg.norm(each.xyz[found[0]] - own))
+            stands = away if away > 1e-6 else None
+    passes = [by_pass[number] for number in sorted(by_pass)]
+    last = passes[-1].probabilities if passes else {}
+    lost = [code for code in last if last[code] == max(last.values()) and not shares[code]]
     least = np.zeros(256) if stage.limits is None else stage.limits.least_reliability()
     limit = max(float(least[order[0]]), stage.reject_below or 0.0)
-    return Verdict(stage.model_file, names, shares, order[0], rival, passes, stands, limit or None)
+    return Verdict(
+        stage.model_file, names, shares, order[0], rival, passes, stands, lost, limit or None
+    )
 
 
 def _trace_pass(model: Model, read: PassInputs, at: int) -> PassTrace:
