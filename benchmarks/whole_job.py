@@ -9,8 +9,8 @@
     # a generated wood at 1.7 points/m2 side by side, or a real tile; 1, 2 and all threads
     python benchmarks/whole_job.py --sparse --sizes 0.25 1 4 --threads 1 2 0 --model standard
     python benchmarks/whole_job.py --sparse DATA/bridge/ign_0299_6802.laz --sizes 4 --model standard
-    # CPU seconds of each part, one thread
-    python benchmarks/whole_job.py --parts
+    # CPU and wall seconds and memory of each part of one job
+    python benchmarks/whole_job.py --parts --sparse --sizes 4 --model standard
     python benchmarks/whole_job.py --json FILE
 
 Trains a model with all defaults on one generated town (kept in --folder), classifies another with
@@ -30,6 +30,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -39,13 +40,14 @@ import laspy
 import numpy as np
 from woods import closed_wood
 
-from pdal_stages import load_model
 from pdal_stages.base.version import __version__
 from pdal_stages.classifier import context_features as contexts
 from pdal_stages.classifier.random_forest import Forest
 from pdal_stages.features import engine as feature_engine
+from pdal_stages.pipeline import classify_file
+from pdal_stages.pipeline.classify_request import ClassifyRequest
+from pdal_stages.pipeline.runtime import ExpandedStage
 from pdal_stages.synthetic import make_town, write_town
-from pdal_stages.terrain import detached_noise, filtered_ground
 
 CLASSES = '{"2":2,"3":3,"4":4,"5":5,"6":6}'
 
@@ -170,64 +172,94 @@ def table(lines: list[dict[str, Any]]) -> str:
     return "\n".join(out)
 
 
-def parts(cloud: Path, model_file: str) -> dict[str, float]:
-    """CPU seconds of each part of the job, in this process with one thread."""
-    spent: dict[str, float] = {}
+class Meter(threading.Thread):
+    """What each part of this process takes: CPU and wall seconds, and the most memory held."""
+
+    def __init__(self) -> None:
+        """Begin with the start of the process."""
+        super().__init__(daemon=True)
+        self.part, self.done = "start", threading.Event()
+        #: by part: CPU seconds, wall seconds, bytes
+        self.parts: dict[str, list[float]] = {"start": [0.0, 0.0, 0.0]}
+        self._at = 0.0, time.perf_counter()
+
+    def switch(self, part: str) -> None:
+        """Count what was spent up to now, and begin another part."""
+        cpu, wall = time.process_time(), time.perf_counter()
+        line = self.parts[self.part]
+        line[0], line[1] = line[0] + cpu - self._at[0], line[1] + wall - self._at[1]
+        self._at, self.part = (cpu, wall), part
+        self.parts.setdefault(part, [0.0, 0.0, 0.0])
+
+    def run(self) -> None:
+        """Look at the memory again and again."""
+        page = resource.getpagesize()
+        while not self.done.wait(0.01):
+            held = int(Path("/proc/self/statm").read_text().split()[1]) * page
+            line = self.parts[self.part]
+            line[2] = max(line[2], held)
+
+
+def parts(cloud: Path, model: str) -> dict[str, list[float]]:
+    """CPU and wall seconds of each stage of a job in this process, and the bytes held at most.
+
+    Of what the model does the CPU seconds are counted by thread.
+    """
+    meter, inside = Meter(), {}
+    counted = threading.Lock()
 
     def timed(name: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def run(*given: Any, **more: Any) -> Any:
-            began = time.process_time()
+            began = time.thread_time()
             try:
                 return work(*given, **more)
             finally:
-                spent[name] = spent.get(name, 0.0) + time.process_time() - began
+                with counted:
+                    inside[name] = inside.get(name, 0.0) + time.thread_time() - began
 
         return run
 
-    def start() -> None:
-        subprocess.run(
-            [sys.executable, "-c", "import pdal_stages.cli, pdal_stages.classifier"], check=True
-        )
+    def run_stage(stage: ExpandedStage, *given: Any) -> None:
+        meter.switch(stage.stage.type)
+        function(stage, *given)
 
-    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-    start()
-    spent["start and import"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
-    las = timed("reading", laspy.read)(cloud)
-    xyz = np.column_stack([las.x, las.y, las.z])
-    axes = np.ascontiguousarray(xyz.T)
-    first_points = axes[:, :2000]  # kernels
-    detached_noise(*first_points)
-    filtered_ground(*first_points, openings=(5, 17), threads=1)
-    timed("noise", detached_noise)(*axes)
-    dimensions = timed("heights", filtered_ground)(*axes, openings=(5, 17), threads=1)
-    dimensions["ReturnNumber"] = np.asarray(las.return_number)
-    dimensions["NumberOfReturns"] = np.asarray(las.number_of_returns)
-    model = load_model(model_file)
-    with tempfile.TemporaryDirectory() as folder:
-        model.predict(
-            xyz[:2000], {k: v[:2000] for k, v in dimensions.items()}, threads=1
-        )  # kernels
-        forest, context, compute = (
-            Forest.predict_proba,
-            contexts.cell_means,
-            feature_engine.Run.compute,
-        )
-        Forest.predict_proba = timed("forests", forest)  # type: ignore[method-assign]
-        contexts.cell_means = timed("context", context)
-        feature_engine.Run.compute = timed("features", compute)  # type: ignore[method-assign]
-        try:
-            prediction = timed("classification", model.predict)(xyz, dimensions, threads=1)
-        finally:
-            # type: ignore[method-assign]
-            Forest.predict_proba, contexts.cell_means = forest, context
-            feature_engine.Run.compute = compute  # type: ignore[method-assign]
-        las.classification = prediction.classification
-        timed("writing", las.write)(Path(folder, "out.laz"))
-    inside = ("features", "forests", "context")
-    spent["the rest of classification"] = spent.pop("classification") - sum(
-        spent.get(k, 0.0) for k in inside
+    def write(*given: Any) -> None:
+        meter.switch("writing")
+        write_copy(*given)
+
+    function, ExpandedStage.function = ExpandedStage.function, run_stage  # type: ignore[method-assign]
+    write_copy, classify_file.write_copy = classify_file.write_copy, write
+    Forest.predict_proba = timed("- forests", Forest.predict_proba)  # type: ignore[method-assign]
+    contexts.cell_means = timed("- context: means", contexts.cell_means)
+    contexts.describe_segments = timed("- context: segments", contexts.describe_segments)
+    contexts.describe_lines = timed("- context: lines", contexts.describe_lines)
+    feature_engine.Run.compute = timed(  # type: ignore[method-assign]
+        "- features", feature_engine.Run.compute
     )
-    return spent
+    meter.start()
+    request = ClassifyRequest(model=model)
+    with tempfile.TemporaryDirectory() as folder:
+        pipeline = request.pipeline(str(cloud), str(Path(folder, "out.laz")))
+        meter.switch("reading")
+        classify_file.classify_file(pipeline, request, str(cloud))
+        meter.switch("end")
+    meter.done.set()
+    return {
+        name: line
+        for part, spent in meter.parts.items()
+        if part != "end"
+        for name, line in [(part, spent), *((k, [v, 0.0, 0.0]) for k, v in inside.items())]
+        if name == part or part == "filters.modelclassifier"
+    }
+
+
+def table_of_parts(lines: dict[str, list[float]], points: int) -> str:
+    """Return a Markdown table."""
+    out = ["| part | CPU s | wall s | bytes held a point |", "|---|---:|---:|---:|"]
+    for name, (cpu, wall, held) in lines.items():
+        rest = f"{wall:.1f} | {held / points:.0f}" if held else " | "
+        out.append(f"| {name} | {cpu:.1f} | {rest} |")
+    return "\n".join(out)
 
 
 def main() -> None:
@@ -260,18 +292,19 @@ def main() -> None:
         "version": __version__,
         "model": Path(model).name,
     }
-    if arguments.parts:
-        result["parts"] = parts(town(arguments.folder, 0.5, 7.0, 2), model)
-        for name, seconds in result["parts"].items():
-            print(f"{name:<28}{seconds:6.2f} CPU s")
+    if arguments.sparse is not None:
+        source = Path(arguments.sparse) if arguments.sparse else wood(arguments.folder)
+        clouds = [side_by_side(arguments.folder, source, n) for n in arguments.sizes or [1]]
+    elif arguments.densities:
+        clouds = [town(arguments.folder, 0.5, density, 2) for density in arguments.densities]
     else:
-        if arguments.sparse is not None:
-            source = Path(arguments.sparse) if arguments.sparse else wood(arguments.folder)
-            clouds = [side_by_side(arguments.folder, source, n) for n in arguments.sizes or [1]]
-        elif arguments.densities:
-            clouds = [town(arguments.folder, 0.5, density, 2) for density in arguments.densities]
-        else:
-            clouds = [town(arguments.folder, size, 7.0, 2) for size in arguments.sizes or [0.5]]
+        clouds = [town(arguments.folder, size, 7.0, 2) for size in arguments.sizes or [0.5]]
+    if arguments.parts:
+        with laspy.open(clouds[0]) as reader:
+            points = reader.header.point_count
+        result["parts"] = parts(clouds[0], model)
+        print(table_of_parts(result["parts"], points))
+    else:
         result["runs"] = [
             measured(cloud, model, arguments.repeats, threads)
             for cloud in clouds

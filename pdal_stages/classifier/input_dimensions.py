@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import DimensionError
+from ..base.threads import map_blocks
 from ..features import return_features
 from ..features.gap_below import NAME as GAP_BELOW
 from ..features.gap_below import gap_below
@@ -79,10 +80,16 @@ def add_surroundings(
 
     These are computed from return numbers and the points (n, 3) around.
     """
-    names = tuple(names)
-    computed = return_features.return_features(names, xyz, dimensions, threads)
-    computed |= gap_below(names, xyz)
-    return {**dimensions, **computed} if computed else dimensions
+    wanted = {*names}
+    together = [wanted & {*group} for group in (*return_features.BY_SCALE, (GAP_BELOW,))]
+
+    def compute(group: set[str]) -> dict[str, npt.NDArray]:
+        return return_features.return_features(group, xyz, dimensions) | gap_below(group, xyz)
+
+    out = dict(dimensions)
+    for columns in map_blocks(compute, [*filter(None, together)], threads):
+        out |= columns
+    return out
 
 
 def take_dimensions(

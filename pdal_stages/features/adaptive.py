@@ -92,7 +92,7 @@ class AdaptiveNeighborhoods(NeighborhoodGroup):
         self.grid, self.halo_m = grid, plan.halo_m
         self.surface_columns = columns_of(self.chosen, SURFACE_FEATURES)
         self.searches = searches_for([columns.neighborhood for columns in self.chosen])
-        self.tree = build_tree(grid.x, grid.y, grid.z)
+        self.tree = build_tree(grid.x, grid.y, grid.z, threads)
         self._surfaces = np.zeros((0, len(S)), np.float32)
         if (self.surface_columns >= 0).any():
             self._surfaces = self._make_surfaces(threads)

@@ -17,16 +17,20 @@ monotone in the coordinates: which points are gathered never depends on rounding
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ..base.jit import device, njit
+from ..base.threads import map_blocks
 
 #: A leaf holds at most this many points: enough that boxes take 4 to 8 bytes a point, few enough
 #: that most of a leaf's points are near. Not tuned.
 LEAF = 24
 
+#: Levels of a tree whose nodes threads share; below they share the trees. Not tuned.
+SHARED_LEVELS = 4
 #: Room for a depth-first traversal, which needs 29 entries for 2**32 points: one a level, and one
 #: more.
 STACK = 80
@@ -44,8 +48,11 @@ class KdTree(NamedTuple):
     depth: int  # levels below the root; all leaves lie on the last
 
 
-def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> KdTree:
-    """Return the tree over a cloud of 1 to 2**32 - 1 points with finite coordinates (n,) each."""
+def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray, threads: int | None = 1) -> KdTree:
+    """Return the tree over a cloud of 1 to 2**32 - 1 points with finite coordinates (n,) each.
+
+    Threads share the nodes of the upper levels, then the trees below these.
+    """
     x, y, z = (np.ascontiguousarray(v, dtype=np.float64) for v in (x, y, z))
     n = len(x)
     if not 1 <= n < 2**32:
@@ -53,16 +60,31 @@ def build_tree(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> KdTree:
     depth = (n // LEAF).bit_length()
     boxes = np.empty((2 ** (depth + 1) - 1, 6))
     tree = KdTree(x, y, z, np.arange(n, dtype=np.uint32), boxes, depth)
-    build_nodes(tree, np.empty(n))
+    keys, parts = np.empty(n), [(0, 0, n)]
+    shared = min(depth, SHARED_LEVELS)
+    for below in range(depth, depth - shared - 1, -1):
+        last = below if below > depth - shared else 0
+        list(map_blocks(partial(build_nodes, tree, keys, below, last), parts, threads))
+        parts = [half for part in parts for half in _halves(*part)]
     return tree
 
 
+def _halves(node: int, lo: int, hi: int) -> list[tuple[int, int, int]]:
+    """Return the children of a node of the points perm[lo:hi], each with its points."""
+    middle = (lo + hi) // 2
+    return [(2 * node + 1, lo, middle), (2 * node + 2, middle, hi)]
+
+
 @njit
-def build_nodes(tree, keys):
-    """Make all nodes of a tree; `keys` (n,) are scratch."""
+def build_nodes(tree, keys, depth, last, part):
+    """Make a node of the points perm[lo:hi], and those below it; `part` is (node, lo, hi).
+
+    It has `depth` levels below. Of nodes with `last` levels below the children are not made.
+    `keys` (n,) are scratch.
+    """
     x, y, z, perm, boxes = tree.x, tree.y, tree.z, tree.perm, tree.boxes
     stack = np.empty((STACK, 4), np.int64)
-    top = push(stack, 0, 0, 0, len(perm), tree.depth)
+    top = push(stack, 0, part[0], part[1], part[2], depth)
     while top > 0:
         top -= 1
         node, lo, hi, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
@@ -71,6 +93,7 @@ def build_nodes(tree, keys):
             boxes[node, i] = box[i]
         if depth > 0:
             middle = halve(x, y, z, perm, keys, lo, hi, box)
+        if depth > last:
             top = push(stack, top, 2 * node + 2, middle, hi, depth - 1)
             top = push(stack, top, 2 * node + 1, lo, middle, depth - 1)
 

@@ -14,7 +14,6 @@ from collections.abc import Container, Iterable, Mapping
 import numpy as np
 import numpy.typing as npt
 
-from ..base.threads import map_blocks
 from .cell_means import WHOLE, cell_means
 
 #: What they are made of.
@@ -30,7 +29,9 @@ FLAGS = {
 GROUP = "returns"
 #: Suffix -> axes and side (meters) of its cells: boxes of 3 and 6 m, columns of 6 m. Not tuned.
 SCALES = {"": (0, 0.0), "_box1": (3, 1.0), "_box2": (3, 2.0), "_column2": (2, 2.0)}
-NAMES = tuple(flag + scale for scale in SCALES for flag in FLAGS)
+#: The features of each scale, which are computed together.
+BY_SCALE = tuple(tuple(flag + scale for flag in FLAGS) for scale in SCALES)
+NAMES = tuple(name for names in BY_SCALE for name in names)
 
 
 def reach(names: Container[str]) -> float:
@@ -43,7 +44,6 @@ def return_features(
     names: Iterable[str],
     xyz: npt.NDArray[np.float64],
     dimensions: Mapping[str, npt.ArrayLike],
-    threads: int | None = None,
 ) -> dict[str, npt.NDArray]:
     """Compute those of `names` that are return features, for every point of a cloud.
 
@@ -63,20 +63,12 @@ def return_features(
     flags[:, 1] = np.where((number > 0) & (number < total), WHOLE, 0)
     del number, total
     values: dict[str, npt.NDArray] = {}
-    scales = {scale: size for scale, size in SCALES.items() if not wanted.isdisjoint(_names(scale))}
-
-    def compute(scale: str) -> tuple[npt.NDArray | slice, npt.NDArray]:
-        axes, side = scales[scale]
-        if not axes:
-            return slice(None), (flags > 0).view(np.uint8)
-        return cell_means(xyz[:, :axes], flags, side)
-
-    for scale, (cell, means) in zip(scales, map_blocks(compute, [*scales], threads), strict=True):
-        columns = zip(_names(scale), means.T, strict=True)
-        values |= {name: column[cell] for name, column in columns if name in wanted}
+    for (axes, side), columns in zip(SCALES.values(), BY_SCALE, strict=True):
+        if wanted.isdisjoint(columns):
+            continue
+        cell: npt.NDArray | slice = slice(None)
+        means: npt.NDArray = (flags > 0).view(np.uint8)
+        if axes:
+            cell, means = cell_means(xyz[:, :axes], flags, side)
+        values |= {name: means[:, k][cell] for k, name in enumerate(columns) if name in wanted}
     return values
-
-
-def _names(scale: str) -> list[str]:
-    """Return the features of a scale."""
-    return [flag + scale for flag in FLAGS]

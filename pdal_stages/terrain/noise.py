@@ -99,13 +99,13 @@ def detached_noise(
             if len(x[points]) > RULES.min_columns:  # fewer show no surface
                 near = x[points], y[points], z[points]
                 state = find_detached(*near, cluster, gap, threads)
-                marks = _judge(*near, column[points], row[points], state, depth)
+                marks = _judge(*near, column[points], row[points], state, depth, threads)
                 found_codes[points if isinstance(points, slice) else points[core]] = marks[core]
         codes[inside] = found_codes
     return codes
 
 
-def _judge(x, y, z, column, row, state, depth) -> NDArray[np.uint8]:
+def _judge(x, y, z, column, row, state, depth, threads) -> NDArray[np.uint8]:
     """Return the codes (n,) of points by their states."""
     left, bottom = column.min() - 1, row.min() - 1
     shape = int(row.max() - bottom + 2), int(column.max() - left + 2)
@@ -120,10 +120,10 @@ def _judge(x, y, z, column, row, state, depth) -> NDArray[np.uint8]:
     np.minimum(solid, heavy, out=base)
     marks = np.where(_stand_above(place, z, state, base, RULES), HIGH, 0)
     _lowest(place, z, np.where(marks == HIGH, SOLID, state), HELD, LOOSE, low.ravel())
-    limit = limits_below_ground(low, base, SIDE, depth).ravel()
+    limit = limits_below_ground(low, base, SIDE, depth, threads).ravel()
     marks[(marks == 0) & (state != HEAVY) & (z < limit[place])] = LOW
     if np.isfinite(heavy).any():
-        limit = limits_below_ground(heavy, solid, SIDE, depth).ravel()
+        limit = limits_below_ground(heavy, solid, SIDE, depth, threads).ravel()
         marks[buried[detached] & (z < limit[place])] = LOW
     codes[detached] = marks
     return codes
