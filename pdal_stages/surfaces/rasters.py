@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -50,23 +51,29 @@ class TileCells:
         x0, y0, wide, tall = (number * self.options.step for number in self.window)
         return x0, y0, x0 + wide, y0 + tall
 
-    def load(self, box: Box, names: tuple[str, ...]) -> list[dict[str, NDArray]]:
-        """Return some arrays of the tiles that share a point with a box, in steps."""
+    def near(self, box: Box) -> list[Tile]:
+        """Return the tiles that share a point with a box, in steps."""
         size = self.options.resolution
         x0, y0, x1, y1 = (side / STEPS for side in box)
         wide = x0 - size, y0 - size, x1 + size, y1 + size
-        there = touching([self.grid.box(tile) for tile in self.files], wide)
-        files = list(self.files.values())
-        return [load_arrays(files[n], names) for n in there]
+        tiles = [*self.files]
+        return [tiles[n] for n in touching([self.grid.box(tile) for tile in tiles], wide)]
 
-    def ground(self, box: Box) -> Integers:
-        """Return the ground points (n, 3) in a box, in steps, as triangles need them."""
+    def ground(self, loaded: dict[Tile, Integers], box: Box) -> Integers:
+        """Return the ground points (n, 3) in a box, in steps, as triangles need them.
+
+        `loaded` keeps those of whole tiles for further calls.
+        """
+        side = self.options.ground_step(self.unit)
         parts = [np.empty((0, 3), np.int64)]
-        for arrays in self.load(box, ("ground",)):
-            x, y, _ = arrays["ground"].T
-            inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
-            parts.append(arrays["ground"][inside])
-        return lowest(np.concatenate(parts), self.options.ground_step(self.unit))
+        for tile in self.near(box):
+            if tile not in loaded:
+                loaded[tile] = load_arrays(self.files[tile], ("ground",))["ground"]
+            # A cell that two tiles share is whole.
+            parts.append(
+                _inside(loaded[tile], (box[0] - side, box[1] - side, box[2] + side, box[3] + side))
+            )
+        return _inside(lowest(np.concatenate(parts), side), box)
 
     def highest(self, window: GridWindow) -> tuple[Integers, Integers]:
         """Return the arrays ``top`` and ``solid`` of a window of cells."""
@@ -74,7 +81,8 @@ class TileCells:
         low = window.left * step, window.bottom * step
         box = *low, low[0] + window.width * step, low[1] + window.height * step
         out = tuple(np.full(window.shape, EMPTY) for _ in range(2))
-        for arrays in self.load(box, ("window", "top", "solid")):
+        for tile in self.near(box):
+            arrays = load_arrays(self.files[tile], ("window", "top", "solid"))
             part = GridWindow(*arrays["window"].tolist())
             both = window.intersect(part)
             for raster, name in zip(out, ("top", "solid"), strict=True):
@@ -113,11 +121,14 @@ def _terrain(cells: TileCells, window: GridWindow) -> Floats:
     step = cells.options.step
     x = (window.left + np.arange(window.width, dtype=float) + 0.5) * step
     y = (window.bottom + np.arange(window.height, dtype=float) + 0.5) * step
+    points_in = partial(cells.ground, {})
+    return heights_at((x, y), cells.reach * STEPS, cells.bounds, points_in) / STEPS
 
-    def points_within(distance: float) -> Integers:
-        return cells.ground((x[0] - distance, y[0] - distance, x[-1] + distance, y[-1] + distance))
 
-    return heights_at((x, y), cells.reach * STEPS, cells.bounds, points_within) / STEPS
+def _inside(points: Integers, box: Box) -> Integers:
+    """Return the points (n, 3) in a box with its edges."""
+    x, y, _ = points.T
+    return points[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]
 
 
 def fill(

@@ -28,7 +28,7 @@ from .cells import EMPTY, STEPS, SurfaceOptions, lowest
 from .make_surfaces import CellSurvey, enclose
 from .report_page import Rasters, render_report
 from .survey_cells import ReportRules, combine, compare_strips, figures_of, reduce_for_report
-from .triangulation import heights_at
+from .triangulation import Box, heights_at
 
 #: Width of pictures in pixels, and voids and control points that are listed, as many as fit a page.
 _WIDTH, _LISTED = 820, 10
@@ -266,8 +266,8 @@ def _control(
     return out
 
 
-def _all_of(points: NDArray[np.int64], distance: float) -> NDArray[np.int64]:
-    """Return points, which are known at any distance."""
+def _all_of(points: NDArray[np.int64], box: Box) -> NDArray[np.int64]:
+    """Return points, whatever the box: all that matter are known."""
     return points
 
 

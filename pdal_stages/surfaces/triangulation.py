@@ -13,14 +13,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
 
 from ..base.errors import optional_import
 from ..base.grid import begins_run
 from ..base.jit import njit
 
 Integers = NDArray[np.int64]
+#: West, south, east, north.
+Box = tuple[float, float, float, float]
 #: Relative error of a determinant in doubles, rounded up (Shewchuk 1997: about 1.1e-15).
 _ROUNDING = 1e-14
 #: How triangles count: their circles reach beyond the known points; they give heights; they are too
@@ -119,48 +123,91 @@ def circles(xy: Integers, triangles: Integers) -> tuple[NDArray[np.float64], NDA
 def heights_at(
     centers: tuple[NDArray[np.float64], NDArray[np.float64]],
     reach: float,
-    bounds: tuple[float, float, float, float],
-    points_within: Callable[[float], Integers],
+    bounds: Box,
+    points_in: Callable[[Box], Integers],
+    near: float = 0.0,
 ) -> NDArray[np.float64]:
     """Return heights (rows, columns) of the triangulation at the centers of cells; NaN for none.
 
     Triangles count if the radius of their circle is at most half of `reach`: within that distance
-    lie all points that decide a cell. Fewer are read first, as few cells lie in wide triangles.
+    lie all points that decide a cell. Most are decided by points much nearer; others are read
+    around the cells that are still open.
 
     Parameters
     ----------
     centers : pair of (columns,) and (rows,) float64
-        Ascending x and y.
+        Ascending x and y, evenly spaced.
     reach : float
     bounds : tuple of float
         West, south, east, north of all points there are.
-    points_within : callable
-        Returns the points (n, 3) within a distance of the centers' rectangle, different in x and y,
-        in the order of :func:`triangulate`.
+    points_in : callable
+        Returns the points (n, 3) in a box, different in x and y, in the order of
+        :func:`triangulate`.
+    near : float
+        Distance around the centers within which points are read first, if not an eighth of `reach`.
     """
     x, y = centers
     west, south, east, north = bounds
-    distance, out = reach / 16, np.full((len(y), len(x)), np.nan)
-    while True:
-        distance = min(2 * distance, reach)
-        points = points_within(distance)
-        box = x[0] - distance, y[0] - distance, x[-1] + distance, y[-1] + distance
-        triangles = triangulate(points[:, :2])
-        middle, radius = circles(points[:, :2], triangles)
-        # Where all points lie inside, a side of the box hides nothing.
-        low = np.where(np.less_equal(box[:2], (west, south)), -math.inf, box[:2])
-        high = np.where(np.greater_equal(box[2:], (east, north)), math.inf, box[2:])
-        r = radius[:, None] * (1 + 1e-9) + 1.0
-        known = (distance == reach) | ((middle - r >= low) & (middle + r <= high)).all(axis=1)
-        kind = np.where(known, np.where(radius <= reach / 2, VALID, TOO_WIDE), UNKNOWN)
-        open_cells = _fill(points.astype(np.float64), triangles, kind, x, y, out)
-        if distance == reach or not open_cells or not np.isfinite([low, high]).any():
-            return out
+    distance, out = near or reach / 8, np.full((len(y), len(x)), np.nan)
+    box = _around(centers, distance)
+    points = points_in(box)
+    triangles = triangulate(points[:, :2])
+    middle, radius = circles(points[:, :2], triangles)
+    # Where all points lie inside, a side of the box hides nothing.
+    low = np.where(np.less_equal(box[:2], (west, south)), -math.inf, box[:2])
+    high = np.where(np.greater_equal(box[2:], (east, north)), math.inf, box[2:])
+    r = radius[:, None] * (1 + 1e-9) + 1.0
+    known = (distance == reach) | ((middle - r >= low) & (middle + r <= high)).all(axis=1)
+    kind = np.where(known, np.where(radius <= reach / 2, VALID, TOO_WIDE), UNKNOWN)
+    is_open = _fill(points.astype(np.float64), triangles, kind, x, y, out)
+    if distance < reach and np.isfinite([low, high]).any():
+        width = 2 * int(distance / (x[1] - x[0])) + 1 if len(x) > 1 else 1
+        for rows, columns in _groups(is_open, width):
+            part = x[columns], y[rows]
+            is_open[rows, columns] &= _in_hull(part, points_in(_around(part, reach)))
+        for rows, columns in _groups(is_open, width):
+            part, farther = (x[columns], y[rows]), min(3 * distance, reach)
+            out[rows, columns] = heights_at(part, reach, bounds, points_in, farther)
+    return out
+
+
+def _around(centers: tuple[NDArray[np.float64], NDArray[np.float64]], distance: float) -> Box:
+    """Return the box that reaches a distance beyond the centers of cells."""
+    x, y = centers
+    return x[0] - distance, y[0] - distance, x[-1] + distance, y[-1] + distance
+
+
+def _groups(mask: NDArray[np.bool_], width: int) -> list[tuple[slice, slice]]:
+    """Return boxes of cells of a mask, those together that lie within a width of each other."""
+    label = ndimage.label(ndimage.maximum_filter(mask, width))[0]
+    return [box for box in ndimage.find_objects(np.where(mask, label, 0)) if box is not None]
+
+
+def _in_hull(
+    centers: tuple[NDArray[np.float64], NDArray[np.float64]], points: Integers
+) -> NDArray[np.bool_]:
+    """Return which centers (rows, columns) may lie within the convex hull of points.
+
+    No triangle of points holds another.
+    """
+    x, y = centers
+    if len(points) < 3:
+        return np.zeros((len(y), len(x)), bool)
+    try:
+        sides = ConvexHull((points[:, :2] - points[0, :2]).astype(np.float64)).equations
+    except QhullError:  # all on a line
+        return np.ones((len(y), len(x)), bool)
+    away = np.full((len(y), len(x)), -math.inf)
+    for east, north, offset in sides:
+        away = np.maximum(
+            away, east * (x - points[0, 0]) + (north * (y - points[0, 1]) + offset)[:, None]
+        )
+    return away <= 1.0
 
 
 @njit
 def _fill(points, triangles, kind, x, y, out):
-    """Write the heights of triangles into `out`; return how many cells no known one decides.
+    """Write the heights of triangles into `out`; return which cells no known one decides.
 
     On a common side or corner the height follows from its two or one points alone, so that it does
     not depend on the triangle.
@@ -183,7 +230,7 @@ def _fill(points, triangles, kind, x, y, out):
                     out[j, i] = z
                 if place == INSIDE or (place == ON_SIDE and kind[t] == VALID):
                     decided[j, i] = True
-    return decided.size - decided.sum()
+    return ~decided
 
 
 @njit
