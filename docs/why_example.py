@@ -16,11 +16,15 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pyogrio
+import rasterio
 import shapely
 
 from pdal_stages.cli import main as command
 from pdal_stages.reports.pictures import CLASS_COLORS, write_png
 
+STEPS = ("minimum_grid", "openings", "round_3", "surface")
+LEVELS = (656.0, 668.0)  # elevations that are drawn dark and bright
+STEPS_TARGET = Path(__file__).resolve().parent / "pictures" / "why-steps.png"
 TARGET = Path(__file__).resolve().parent / "pictures" / "why-hamlet.png"
 #: Middle of the section that is drawn, and half its length and width, in meters.
 SECTION = (931136.3, 6449661.8, 12.0, 2.0)
@@ -56,6 +60,22 @@ def section(path: Path) -> np.ndarray:
     return image
 
 
+def steps(folder: Path) -> np.ndarray:
+    """Return rasters of the ground filter (height, width, 3) side by side, high cells bright."""
+    rasters = []
+    for name in STEPS:
+        (path,) = (folder / name).glob("*.tif")
+        with rasterio.open(path) as file:
+            values = file.read(1).astype(float)
+            values[values == file.nodata] = np.nan
+        gray = np.clip((values - LEVELS[0]) / np.ptp(LEVELS), 0, 1) * 215 + 40
+        empty = np.isnan(values)
+        rgb = np.where(empty[..., None], (255, 255, 255), np.nan_to_num(gray)[..., None])
+        enlarged = np.kron(rgb.astype(np.uint8), np.ones((7, 7, 1), np.uint8))
+        rasters += [enlarged, np.full((len(enlarged), 14, 3), 255, np.uint8)]
+    return np.concatenate(rasters[:-1], axis=1)
+
+
 def main() -> None:
     """Run the example."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -65,7 +85,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         first, second = folder / "hamlet.laz", folder / "second.laz"
-        run("classify", raw, first)
+        kept = folder / "steps"
+        run("classify", raw, first, f"--filters.hag_morphological.keep_rasters={kept}")
+        write_png(STEPS_TARGET, steps(kept))
         run("review", first, folder / "review.gpkg", "--json", folder / "review.json")
         cloud = laspy.read(first)
         x, y = (np.array(axis) for axis in (cloud.x, cloud.y))

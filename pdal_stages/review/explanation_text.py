@@ -174,9 +174,7 @@ def _verdict(verdict: Verdict) -> list[str]:
         stands = f"a point {verdict.stands_for_it_m:.2f} m away stands for it: its inputs are shown"
         out.append(_row("its voxel", stands))
     for code in verdict.excluded:
-        out.append(
-            _row("line", f"no row of points around makes it a {_class(code)}: the next class")
-        )
+        out.append(_row("no line", f"of such points passes here, so it is no {_class(code)}"))
     if not passes or not passes[0].start:
         return [*out, _row("reasons", "a network, or another learner than a forest, gives none")]
     pair = verdict.winner, verdict.rival
