@@ -262,7 +262,6 @@ class Survey:
 
         Inputs that stages see together must have the same.
         """
-        needed = bool(plan.in_tiles and plan.sees_m)
         known: dict[str, Reference] = {}  # PDAL is asked once for equal references
         references: dict[str, Reference] = {}
         for source in self.readable():
@@ -275,14 +274,14 @@ class Survey:
                 source.fault = str(error)
                 continue
             except StageError:
-                if needed:
+                if plan.one_reference:
                     raise
                 known[kind] = Reference(Units())  # no stage needs it
             references[source.path] = known[kind]
         if not references:
             reasons = (source.fault for source in self.sources)
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
-        if needed:
+        if plan.one_reference:
             messages = check_one_reference(references)
             if messages and per == "file":
                 messages[0] += (

@@ -17,7 +17,7 @@ from ..pipeline.run import Pipeline
 from ..stages.base import Blocks
 from .options import Box, TileGrid
 from .planned_stage import PlannedStage, check_ends, check_in_tiles, check_linear
-from .rounds import Round, cut_into_rounds, make_round
+from .rounds import Round, RoundStage, cut_into_rounds, make_round
 
 #: Dimension that follows a point through a tile's pipeline: its row in the piece of its input.
 ROW = "PdalStagesRow"
@@ -40,6 +40,7 @@ class TilePlan:
     #: Files that each stage reads, in tiles and then per output: models, maps and more.
     files: list[list[str]]
     sees_m: float  #: meters around a tile within which points may matter
+    one_reference: bool  #: whether all inputs must have the same reference system
     #: Dimensions that stages in tiles change; None where unknown because of PDAL's filters in it.
     creates: list[str] | None
     unit: str  #: `horizontal_unit` of our stages; empty: the unit of the spatial reference
@@ -73,7 +74,7 @@ class TilePlan:
         """Return the plan for a number of tiles; nothing lies around a single one."""
         count, rounds = len(self.in_tiles), self.rounds
         if tiles == 1:
-            rounds = [Round(0, count, [0.0] * count, [0.0] * count, self.halo_m)]
+            rounds = [Round(0, count, [RoundStage(0.0, 0.0)] * count, self.halo_m)]
         elif tiles_per_square == 1 and len(rounds) > 1 and rounds[-1].begin == count:
             rounds = rounds[:-1]  # the last squares are tiles
         return replace(self, rounds=rounds)
@@ -120,6 +121,7 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         check_in_tiles(stage, number < end, buffer)
     in_tiles, per_output = filters[:end], [*filters[end:], *writers]
     reaches = [stage.reach(buffer) for stage in in_tiles]
+    sees_m = make_round(in_tiles, reaches, 0, end).halo_m
     ours_in_tiles = [stage.ours for stage in in_tiles if stage.ours is not None]
     makes = {name: kind for stage in ours_in_tiles for name, kind in stage.creates().items()}
     foreign = any(stage.ours is None and stage.type != "filters.merge" for stage in in_tiles)
@@ -129,7 +131,8 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
         rounds=cut_into_rounds(in_tiles, reaches),
         per_output=[stage.options for stage in per_output],
         files=[stage.files for stage in [*in_tiles, *per_output]],
-        sees_m=make_round(in_tiles, reaches, 0, end).halo_m,
+        sees_m=sees_m,
+        one_reference=bool(in_tiles and sees_m),
         creates=None if foreign else list(makes),
         makes=makes,
         unit=next((s.horizontal_unit for s in ours_in_tiles if s.horizontal_unit), ""),

@@ -79,7 +79,7 @@ class RoundJobs:
         far = self.run.farthest if self.run.plan.rounds[number + 1].halo_m else 0.0
         for job in users:
             box = grid.box(job.tile, far)
-            job.jobs = squares_in(box) if part.kept else []
+            job.jobs = squares_in(box) if part.saved else []
         if part.blocks is None:
             return list(squares.values()), []
         boxes = [survey.grid.box(job.tile) for job in self.run.tiles]

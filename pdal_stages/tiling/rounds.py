@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from ..stages.base import Blocks
 from .planned_stage import PlannedStage
@@ -14,21 +15,29 @@ from .planned_stage import PlannedStage
 _FAR_M = 64.0
 
 
+class RoundStage(NamedTuple):
+    """How far around a tile a stage of a round matters, in meters.
+
+    A stage that looks 10 m far, after one that looks 5 m far, of which a later stage reads the
+    results within 3 m of the tile, has `used_m` 3 and `before_m` 5: it is right there if points
+    within 3 + 10 + 5 m are read.
+    """
+
+    used_m: float  #: later stages of the round use its results so far outside the tile
+    before_m: float  #: the stages before it look so far beyond the points that it reads
+
+
 @dataclass(frozen=True)
 class Round:
     """Stages that run on all tiles, or larger squares, before later stages do."""
 
     begin: int  #: index of its first stage in :attr:`.plan.TilePlan.in_tiles`
     end: int  #: index after its last stage
-    #: Of each stage, meters outside the tile within which later ones of the round use its results.
-    used_m: list[float]
-    #: Of each, how far around the points that it reads they must lie for the stages before it to
-    #: be right.
-    upstream_m: list[float]
-    halo_m: float  #: of each tile
-    #: Dimensions that the stages before `end` change, saved for the next round. Empty: there are
-    #: none, or the next round runs these stages again.
-    kept: list[str] = field(default_factory=list)
+    stages: list[RoundStage]
+    halo_m: float  #: how far around each tile points are read
+    #: Dimensions that are saved for the next round, which are those that the stages before `end`
+    #: change. Where it is empty, they change none, or the next round runs them again.
+    saved: list[str] = field(default_factory=list)
     #: Of the far-reaching stage at `end`: squares that are computed of all points.
     blocks: Blocks | None = None
 
@@ -38,21 +47,22 @@ def make_round(
     reaches: list[float],
     begin: int,
     end: int,
-    kept: Sequence[str] = (),
+    saved: Sequence[str] = (),
     blocks: Blocks | None = None,
 ) -> Round:
     """Return a round of the stages from `begin` to `end`, which look `reaches` (meters) far."""
     part, reaches = stages[begin:end], reaches[begin:end]
-    used, upstream = [0.0] * len(part), [0.0] * len(part)
+    used, before = [0.0] * len(part), [0.0] * len(part)
     for n, stage in enumerate(part):
         seen = [k for k in range(n) if stage.sees_results_of(part[k])]
-        upstream[n] = max((reaches[k] + upstream[k] for k in seen), default=0.0)
+        before[n] = max((reaches[k] + before[k] for k in seen), default=0.0)
     for n in range(len(part) - 1, -1, -1):
         for m in range(n + 1, len(part)):
             reach = reaches[m] if part[m].sees_results_of(part[n]) else 0.0
             used[n] = max(used[n], used[m] + reach)
     halo = max((u + reach for u, reach in zip(used, reaches, strict=True)), default=0.0)
-    return Round(begin, end, used, upstream, halo, list(kept), blocks)
+    distances = [RoundStage(*each) for each in zip(used, before, strict=True)]
+    return Round(begin, end, distances, halo, list(saved), blocks)
 
 
 def cut_into_rounds(stages: list[PlannedStage], reaches: list[float]) -> list[Round]:
@@ -65,23 +75,23 @@ def cut_into_rounds(stages: list[PlannedStage], reaches: list[float]) -> list[Ro
     for at, stage in enumerate(stages):
         only = not open_ended and not any(each.blocks for each in rounds)
         blocks = stage.ours.blocks() if stage.ours is not None and only else None
-        kept = _kept(stages[:at])
-        if blocks is not None or (kept is not None and at > begin and reaches[at] > _FAR_M):
-            rounds.append(make_round(stages, reaches, begin, at, kept=kept or [], blocks=blocks))
-            begin = begin if kept is None else at
+        changed = _changed_by(stages[:at])
+        if blocks is not None or (changed is not None and at > begin and reaches[at] > _FAR_M):
+            rounds.append(make_round(stages, reaches, begin, at, changed or [], blocks))
+            begin = begin if changed is None else at
         if blocks is not None:
             reaches = [*reaches[:at], 0.0, *reaches[at + 1 :]]
         open_ended = open_ended or (stage.ours is not None and stage.ours.open_ended)
     rounds.append(make_round(stages, reaches, begin, len(stages)))
-    kept = _kept(stages)
-    if kept and rounds[-1].halo_m > _FAR_M:  # on squares, of which tiles then take their points
-        rounds[-1] = replace(rounds[-1], kept=kept)
+    changed = _changed_by(stages)
+    if changed and rounds[-1].halo_m > _FAR_M:  # on squares, of which tiles then take their points
+        rounds[-1] = replace(rounds[-1], saved=changed)
         rounds.append(make_round(stages, reaches, len(stages), len(stages)))
     return rounds
 
 
-def _kept(before: list[PlannedStage]) -> list[str] | None:
-    """Return the dimensions that stages change, if saving these is enough; else None."""
+def _changed_by(before: list[PlannedStage]) -> list[str] | None:
+    """Return the dimensions that stages change; None where saving these is not enough."""
     if any(stage.ours is None and stage.type != "filters.merge" for stage in before):
         return None  # which may drop points
     return sorted({name for stage in before if stage.ours for name in stage.ours.creates()})

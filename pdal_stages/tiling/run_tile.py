@@ -91,8 +91,6 @@ class _RoundRun:
     #: Dimensions of the tile's own points alone, to save memory; one for each view.
     views: list[dict[str, NDArray]] = field(default_factory=list)
     reduced: list[dict[str, NDArray]] = field(default_factory=list)  #: one for each view
-    #: Place in the pipeline of our stages -> its number in :attr:`TilePlan.in_tiles`.
-    steps: dict[int, int] = field(default_factory=dict)
     expanded: dict[int, ExpandedStage] = field(default_factory=dict)  #: by place in the pipeline
 
     def run(self) -> RoundResult:
@@ -100,7 +98,7 @@ class _RoundRun:
         plan = self.context.plan
         part = plan.rounds[self.number]
         origins = self._origins()
-        pipeline = self._pipeline(origins)
+        pipeline, numbers = self._pipeline(origins)
         if plan.read_here:
             parts = [(piece.layout, piece.records) for piece in self.pieces]
             known = _concatenate_by_name(origins)
@@ -110,8 +108,8 @@ class _RoundRun:
             pipeline.execute(arrays=False)
         if not self.complete:
             for number, stage in self.expanded.items():
-                step = self.steps[number] - part.begin
-                distance_m = part.used_m[step] + part.upstream_m[step]
+                far = part.stages[numbers[number] - part.begin]
+                distance_m = far.used_m + far.before_m
                 self.needs_m += [distance_m + r.reach for r in stage.reports if r.beyond_halo]
         messages = _messages(pipeline, self.context.scratch)
         if plan.where and len(origins) and not any(each[SELECTED].any() for each in origins):
@@ -128,7 +126,7 @@ class _RoundRun:
         """Return dimensions that number a piece's points, with what an earlier round changed."""
         plan, context = self.context.plan, self.context
         changed = [ChangedValues()] * len(self.pieces)
-        if self.number and plan.rounds[self.number - 1].kept:
+        if self.number and plan.rounds[self.number - 1].saved:
             box = self._box(self.halo_m / context.unit)
             changed = load_changes(context, self.number - 1, box, self.pieces)
         return [
@@ -136,25 +134,31 @@ class _RoundRun:
             for number, piece in enumerate(self.pieces)
         ]
 
-    def _pipeline(self, origins: Sequence[Mapping[str, NDArray]]) -> Pipeline:
-        """Return the pipeline of the round, its stages with their contexts."""
+    def _pipeline(
+        self, origins: Sequence[Mapping[str, NDArray]]
+    ) -> tuple[Pipeline, dict[int, int]]:
+        """Return the pipeline of the round, its stages with their contexts.
+
+        By the place there of each of our stages its number in :attr:`.plan.TilePlan.in_tiles`
+        is returned, too.
+        """
         plan, ready = self.context.plan, ready_stages(self.context)
         part = plan.rounds[self.number]
-        stages = self._stages_here() if plan.read_here else self._stages(origins)
+        stages, numbers = self._stages_here() if plan.read_here else self._stages(origins)
         ours = [stage for stage in ready[part.begin : part.end] if stage is not None]
         pipeline = Pipeline(stages, ready=ours)
         self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
         if part.end == len(plan.in_tiles) and not plan.copied:  # codes of earlier rounds may change
             check_outputs([*pipeline.expanded.stages, *plan.per_output], pipeline.expanded.ours)
         for number, stage in self.expanded.items():
-            used_m = part.used_m[self.steps[number] - part.begin]
+            used_m = part.stages[numbers[number] - part.begin].used_m
             stage.update_context(outside=OUTSIDE, used_m=used_m)
         earlier = plan.rounds[self.number - 1] if self.number else None
         if earlier is not None and earlier.blocks is not None:
-            far = next(n for n, step in self.steps.items() if step == earlier.end)
+            far = next(place for place, number in numbers.items() if number == earlier.end)
             blocks = load_blocks(self.context, self._box(), self.halo_m)
             self.expanded[far].update_context(blocks=blocks)
-        return pipeline
+        return pipeline, numbers
 
     @property
     def _is_last(self) -> bool:
@@ -163,19 +167,22 @@ class _RoundRun:
     def _box(self, halo_units: float = 0.0) -> Box:
         return self.context.grid_of(self.number).box(self.tile, halo_units)
 
-    def _stages_here(self) -> list[StageJson]:
-        """Return the pipeline of a round that runs without PDAL: a reader and the steps."""
+    def _stages_here(self) -> tuple[list[StageJson], dict[int, int]]:
+        """Return the pipeline of a round that runs without PDAL, and the numbers of our stages."""
         part = self.context.plan.rounds[self.number]
         stages: list[StageJson] = [{**self.pieces[0].source.reader, "filename": "piece.las"}]
+        numbers: dict[int, int] = {}
         for number in range(part.begin, part.end):
-            self.steps[len(stages)] = number
+            numbers[len(stages)] = number
             stages.append(with_threads(self.context.plan.in_tiles[number], self.context.threads))
-        return stages
+        return stages, numbers
 
-    def _stages(self, origins: Sequence[Mapping[str, NDArray]]) -> list[StageJson]:
-        """Return the pipeline of a round with PDAL's filters.
+    def _stages(
+        self, origins: Sequence[Mapping[str, NDArray]]
+    ) -> tuple[list[StageJson], dict[int, int]]:
+        """Return the pipeline of a round with PDAL's filters, and the numbers of our stages.
 
-        It reads pieces that are written for it, with their origin as extra bytes, runs the steps,
+        It reads pieces that are written for it, with their origin as extra bytes, runs the stages,
         and calls functions that take their results.
         """
         plan, context = self.context.plan, self.context
@@ -191,21 +198,21 @@ class _RoundRun:
         part = plan.rounds[self.number]
         # PDAL's own filters see one file at a time, until a stage merges them.
         apart = len(self.pieces) > 1
-        head_begins = len(stages)
-        for number, step in enumerate(plan.in_tiles[part.begin : part.end], part.begin):
-            if apart and _merges(step):
+        first, numbers = len(stages), {}
+        for number, stage in enumerate(plan.in_tiles[part.begin : part.end], part.begin):
+            if apart and _merges(stage):
                 stages.append({"type": "filters.merge"})
                 apart = False
             place = len(stages)
-            stages.append(with_threads(step, context.threads))
-            kind = stage_types().get(step["type"])
+            stages.append(with_threads(stage, context.threads))
+            kind = stage_types().get(stage["type"])
             if kind is not None:
-                self.steps[place] = number
+                numbers[place] = number
                 if kind.open_ended and not self.complete:
                     stages.append(self.callbacks.filter(partial(self._measure_reach, place)))
         stages.append(self.callbacks.filter(self._take))
-        stages[head_begins]["inputs"] = tags
-        return stages
+        stages[first]["inputs"] = tags
+        return stages, numbers
 
     def _after(self, expanded: ExpandedStage, seen: Mapping[str, NDArray]) -> None:
         """Ask an open-ended stage that has run which halo it needs."""
@@ -225,7 +232,7 @@ class _RoundRun:
     def _take(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
         """Take the results of the tile's own points, and reduce these for blocks."""
         part = self.context.plan.rounds[self.number]
-        wanted = self.context.plan.creates if self._is_last else part.kept
+        wanted = self.context.plan.creates if self._is_last else part.saved
         names = [name for name in (ins if wanted is None else wanted) if name in ins]
         rows = np.flatnonzero(ins[OUTSIDE] < 0)
         origins = [ROW, INPUT, *(name for name in names if name not in _ORIGIN)]
@@ -470,7 +477,7 @@ def _save(halo: _TileHalo, result: RoundResult, target: str) -> JsonObject:
     """Save what the next round, or an output, needs; return the file in a record."""
     plan = halo.context.plan
     part, arrays = plan.rounds[halo.number], arrays_of(result.results)
-    if halo.number + 1 < len(plan.rounds) and not part.kept:
+    if halo.number + 1 < len(plan.rounds) and not part.saved:
         arrays = {}
     if part.blocks is not None:
         arrays |= _concatenate_by_name([{"around": np.empty((0, 3))}, *result.reduced])

@@ -50,9 +50,19 @@ _MOST_REASONS = 3
 def plan_of_records(name: str, files: Sequence[str]) -> TilePlan:
     """Return a plan without stages: inputs must have one reference, and nothing lies around."""
     reader = {"type": "readers.las", "filename": list(files)}
-    rounds = [Round(0, 0, [], [], 0.0)]
-    # Two meters that matter around a tile, so that references are compared.
-    return TilePlan([reader], [{"type": name}], rounds, [], [[]], 2.0, [], "", [], name)
+    return TilePlan(
+        readers=[reader],
+        in_tiles=[],
+        rounds=[Round(0, 0, [], 0.0)],
+        per_output=[],
+        files=[],
+        sees_m=0.0,
+        one_reference=True,
+        creates=[],
+        unit="",
+        messages=[],
+        name=name,
+    )
 
 
 class RecordRun(SurveyRun):
