@@ -49,6 +49,9 @@ from .prediction import (
 #: tuned).
 DENSITY_TOLERANCE = 2.0
 
+#: Part of the message about a cloud whose density the model was not trained on.
+OTHER_DENSITY = "points/m2, the model was trained on"
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
@@ -325,7 +328,7 @@ class Model:
         low, high = trained["low"] / DENSITY_TOLERANCE, trained["high"] * DENSITY_TOLERANCE
         if not low <= points_per_m2 <= high:
             request.report.warnings.append(
-                f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
+                f"the cloud has {points_per_m2:.3g} {OTHER_DENSITY} "
                 f"{model_description.range_text(trained)}. Expect lower accuracy, or train with "
                 "'thin'"
             )

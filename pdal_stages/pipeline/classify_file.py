@@ -38,7 +38,7 @@ def classify_file(
     writes = writes_las(pipeline.source.stages[-1])
     layout = None
     if is_las(source):  # others are checked when the pipeline is run
-        pipeline.check_inputs(pdal=not pipeline.copied)
+        pipeline.settle_inputs(pdal=not pipeline.copied)
         layout = Layout.of_file(source)
     if layout is not None and pipeline.is_read_here and writes:
         return _copy(pipeline, request, layout)

@@ -24,7 +24,7 @@ from ..stages.points import MAKERS
 from ..stages.registry import PDAL_OWN, stage_from, stage_type, stage_types
 from .inputs_outputs import is_reader, readers_files
 from .json_source import PipelineSource
-from .pdal_facts import check_copc_outputs, check_outputs
+from .pdal_facts import check_class_codes, check_copc_outputs
 from .runtime import BY_LABEL, TRAMPOLINE, ExpandedStage, python_filter
 from .spatial_reference import fault_of_reference
 
@@ -84,7 +84,7 @@ def expand(
         out.stages.append(expanded.plain)
     if not ready:
         _place_upstream(out)
-    check_outputs(out.stages, out.ours, copied)
+    check_class_codes(out.stages, out.ours, copied)
     return out
 
 

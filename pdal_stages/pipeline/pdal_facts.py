@@ -51,7 +51,8 @@ class Fact(NamedTuple):
 
     until: tuple[int, int, int]  #: the first version that does not
     what: str
-    #: Returns what shows it, of a file, its header and its reader; empty where it does not apply.
+    #: Takes a file's path, header and reader; returns the value that shows the fault, and an empty
+    #: text where the file does not have it.
     shows: Callable[[str, LasHeader, StageJson], str]
     cure: str = CURE
 
@@ -238,7 +239,7 @@ def las_headers(readers: Sequence[StageJson]) -> list[LasHeader]:
     return [h for h in map(header_there, readers_files(readers, las=True)) if h is not None]
 
 
-def check_outputs(
+def check_class_codes(
     stages: list[StageJson], ours: Collection[ExpandedStage], copied: bool = False
 ) -> None:
     """Refuse class codes and numbers of extra dimensions that a later LAS writer cannot hold.

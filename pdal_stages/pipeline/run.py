@@ -141,7 +141,7 @@ class Pipeline:
         """Let PDAL check its own stages' options and dimensions, without reading points."""
         stages = self.expanded.stages
         try:
-            self.check_inputs()
+            self.settle_inputs()
             # Some of PDAL's writers open their file, and empty it, when they are prepared: they
             # get files in a folder of ours.
             with TemporaryDirectory(prefix="pdal-stages-") as folder:
@@ -222,7 +222,7 @@ class Pipeline:
         StageError
             What went wrong, where, and how to fix it.
         """
-        self.check_inputs()
+        self.settle_inputs()
         self.check_outputs()
         runtime.remember_stdout()
         for ours in self.expanded.ours:
@@ -263,8 +263,8 @@ class Pipeline:
             if not ours.reports:
                 ours.reports.append(runtime.run_on_nothing(ours.stage))
 
-    def check_inputs(self, pdal: bool = True) -> None:
-        """Open all inputs and check headers of LAS files, which PDAL may read as if whole.
+    def settle_inputs(self, pdal: bool = True) -> None:
+        """Check all inputs, and settle what follows from them: warnings, scales of text in LAS.
 
         `pdal`: PDAL will read them.
         """
@@ -291,7 +291,7 @@ class Pipeline:
             pdal_facts.check_flags(stages)
         for stage in stages:
             if stage["type"] == "readers.text":
-                self._check_text(stage)
+                self._settle_text(stage)
             elif stage["type"] == "readers.ept":
                 check_ept(ept_address(str(stage.get("filename", ""))))
             elif stage["type"] == "readers.copc" and pdal_env.knows_copc():
@@ -300,7 +300,7 @@ class Pipeline:
         if units := [ours.stage.horizontal_unit for ours in self.expanded.ours]:
             self.warnings += check_readers(stages, next(filter(None, units), ""))
 
-    def _check_text(self, reader: StageJson) -> None:
+    def _settle_text(self, reader: StageJson) -> None:
         """Check a text file; let a writer of LAS hold its coordinates, where no option says how."""
         for path in readers_files([reader]):
             held = check_text(path, reader)

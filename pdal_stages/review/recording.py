@@ -16,6 +16,7 @@ from ..base.errors import StageError
 from ..base.grid import GridWindow
 from ..base.las_points import USUAL, Layout, RecordColumns, SomeRows, read_records
 from ..classifier.interface import PassInputs
+from ..classifier.model import OTHER_DENSITY
 from ..features.cell_means import density
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.copies import run_stages, selection
@@ -168,7 +169,7 @@ class Recording:
         part, known = SomeRows(seen, rows), {_OUTSIDE: outside}
         self.seen = run_stages(ours[first:], part, wkt, known, self._keep_classes)
         texts = [*pipeline.expanded.warnings, *pipeline.messages]
-        self.notes = [text for text in texts if "points/m2" not in text]
+        self.notes = [text for text in texts if OTHER_DENSITY not in text]
 
     def _keep(self, name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
         if not self.pieces or name in self.pieces[-1]:  # each piece begins with the same step

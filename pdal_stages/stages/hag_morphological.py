@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,11 @@ class HagMorphological(FarReaching, settings=FilterOptions):
             rasterio()
             folder = Path(self.keep_rasters)
             check_writable(folder / "x.tif" if folder.is_dir() else folder, "raster")
-        self._filter = FilterOptions(
+        self._filter  # noqa: B018  (it refuses options that contradict each other)
+
+    @cached_property
+    def _filter(self) -> FilterOptions:
+        return FilterOptions(
             **{name: self.options[name] for name in _FILTER},
             slope_too=self.terrain_slope,
             threads=self.threads,

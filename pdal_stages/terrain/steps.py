@@ -29,8 +29,9 @@ class FilterStep:
 
     name: str
     run: Run
-    #: An earlier step, or POINTS: how far away what it made can change what this one makes of a
-    #: cell.
+    #: Of each earlier step that this one reads, or of POINTS, the distance within which a change
+    #: there changes what this step makes of a cell: {"openings": 3} reads that raster up to three
+    #: cells away.
     reach: Mapping[str, int]
     #: What it made, as a raster (h, w): NaN or HOLE where that is nothing.
     shows: Callable[[GroundRaster], NDArray]

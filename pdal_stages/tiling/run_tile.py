@@ -36,7 +36,7 @@ from ..base.las_copy import LasCopy
 from ..base.las_points import RecordColumns, SomeRows
 from ..base.messages import shorten
 from ..pipeline.copies import selection
-from ..pipeline.pdal_facts import check_outputs
+from ..pipeline.pdal_facts import check_class_codes
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
@@ -149,7 +149,7 @@ class _RoundRun:
         pipeline = Pipeline(stages, ready=ours)
         self.expanded = {stage.number: stage for stage in pipeline.expanded.ours}
         if part.end == len(plan.in_tiles) and not plan.copied:  # codes of earlier rounds may change
-            check_outputs([*pipeline.expanded.stages, *plan.per_output], pipeline.expanded.ours)
+            check_class_codes([*pipeline.expanded.stages, *plan.per_output], pipeline.expanded.ours)
         for number, stage in self.expanded.items():
             used_m = part.stages[numbers[number] - part.begin].used_m
             stage.update_context(outside=OUTSIDE, used_m=used_m)

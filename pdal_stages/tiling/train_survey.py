@@ -141,7 +141,7 @@ class TrainTask:
         stages = [*map(dict, heights)] or [{"type": "filters.merge"}]  # one end of all readers
         pipeline = Pipeline([*readers, *stages], self._other_overrides)
         if pipeline.is_read_here:
-            pipeline.check_inputs(pdal=False)
+            pipeline.settle_inputs(pdal=False)
             columns = columns_of_files(files)
             wkt = next(filter(None, (text_of(reader)[0] for reader in readers)), "")
             points = self.stage.points(pipeline.run_here(columns, wkt), wkt=wkt)
