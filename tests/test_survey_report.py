@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections import defaultdict
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -183,6 +185,14 @@ def test_a_far_point_is_counted_named_and_in_no_raster(result, cloud, control, t
     assert again["survey"]["points"] == result["survey"]["points"] + 1
     for part in ("voids", "strips", "control"):
         assert again[part] == result[part]
+    widths = [picture_widths(text) for text in (Path(page), cloud.with_name("report.html"))]
+    assert len(widths[0]) == len(widths[1]) and 0.7 < widths[0][0] / widths[1][0] < 1.5
+
+
+def picture_widths(page):
+    """The widths in pixels of the pictures in a page."""
+    pictures = re.findall('base64,([^"]+)"', page.read_text())
+    return [int.from_bytes(base64.b64decode(text)[16:20], "big") for text in pictures]
 
 
 def test_the_page(result, cloud):

@@ -117,7 +117,8 @@ def _measure(
     """Reduce all tiles; return the figures, and rasters to draw."""
     survey, unit = run.survey, run.survey.unit
     units = survey.reference.units
-    x0, y0, x1, y1 = survey.bounds
+    run.read_inputs()
+    x0, y0, x1, y1 = survey.find_lone_points().others
     rules = ReportRules(
         density=10.0 / unit,
         void=math.sqrt(void) / unit,

@@ -101,6 +101,7 @@ class LonePoints:
 
     grid: TileGrid  #: of the squares
     keys: NDArray[np.int64]  #: (k,) their squares, sorted
+    others: Box  #: box of the other points, or of their squares where that is narrower
 
     def among(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which points (n,) are lone ones."""
@@ -313,7 +314,14 @@ class Survey:
             place, there = places_among(key, key[few] + key_offset(columns, rows))
             around += np.where(there, points[place], 0)
         lone = key[few[around < _COMPANY]]
-        return LonePoints(self.lone_grid, lone if len(lone) < len(key) else lone[:0])
+        if not len(lone) or len(lone) == len(key):
+            return LonePoints(self.lone_grid, lone[:0], self.bounds)
+        column, row, _ = squares[~np.isin(key, lone)].T
+        west, south = self.lone_grid.box((int(column.min()), int(row.min())))[:2]
+        east, north = self.lone_grid.box((int(column.max()), int(row.max())))[2:]
+        x0, y0, x1, y1 = self.bounds
+        box = max(x0, west), max(y0, south), min(x1, east), min(y1, north)
+        return LonePoints(self.lone_grid, lone, box)
 
     @property
     def layout(self) -> dict[str, float]:
