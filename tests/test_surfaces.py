@@ -335,6 +335,8 @@ def test_bad_input(survey, tmp_path):
     damaged = tmp_path / "f.las"
     damaged.write_bytes(Path(here).read_bytes()[:-5000])
     refused("cannot be read|cut short|shorter", [str(damaged)])
+    with pytest.raises(StageError, match="folder of the rasters cannot be created"):
+        write_surfaces([here], here, progress=False)
     out.mkdir(exist_ok=True)
     (out / "surface.tif").mkdir()
     refused("names a folder", [here])

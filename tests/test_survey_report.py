@@ -249,5 +249,6 @@ def test_the_command(cloud, control, tmp_path, capsys):
     more = ["--control", str(control), "--json", str(figures), "--density", "3", "--no-progress"]
     assert main(["report", str(cloud), str(page), *more]) == 0
     shown = capsys.readouterr().out
+    assert "control points: mean +0.0" in shown and "m, 1 outside the terrain" in shown
     assert "strips 7 and 9: median +0.12" in shown and f"written to {page}, {figures}" in shown
     assert json.loads(figures.read_text())["density"]["ordered"] == 3.0

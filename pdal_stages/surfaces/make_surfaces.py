@@ -90,7 +90,11 @@ def write_surfaces(
     paths = {name: place / f"{name}.tif" for name in RASTERS}
     options, chosen = options or SurfaceOptions(), replace(tiling or TilingOptions(), per="tile")
     survey = CellSurvey("surfaces", files, place, chosen, options)
-    place.mkdir(parents=True, exist_ok=True)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        what = "the folder of the rasters cannot be created"
+        raise StageError(what, found=f"{folder}: {error.strerror}") from None
     check_outputs([Output(str(path), "raster") for path in paths.values()], files)
     with record_run(survey, chosen, place, progress) as run:
         return _run(run, paths, options)

@@ -282,6 +282,10 @@ def lines(result: JsonObject) -> list[str]:
     for pair in result["strips"][:1]:
         text = "strips {} and {}: median {median_m:+.3f} m, RMS {rms_m:.3f} m"
         out.append(text.format(*pair["strips"], **pair))
-    if control and control["points"]:
-        out.append("control points: mean {mean_m:+.3f} m, RMSE {rmse_m:.3f} m".format(**control))
+    if control:
+        texts = []
+        if control["points"]:
+            texts.append("mean {mean_m:+.3f} m, RMSE {rmse_m:.3f} m".format(**control))
+        texts += [f"{len(control['outside']):,} outside the terrain"] * bool(control["outside"])
+        out.append(f"control points: {', '.join(texts)}")
     return out
