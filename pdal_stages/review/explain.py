@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..base.errors import OptionError
+from ..base.las import header_there
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
@@ -16,7 +17,9 @@ from .explanation import AskedPlace, Explanation
 from .recording import Recording, Surroundings
 from .trace_points import trace_point
 
-#: Side in meters of squares whose points are explained in one run (not tuned).
+#: Files with fewer points together are read once, for all places (not tuned).
+_FEW_POINTS = 5_000_000
+#: Side in meters of squares of larger ones whose places are explained in one run (not tuned).
 _SQUARE_M = 256.0
 
 
@@ -54,9 +57,12 @@ def explain_points(
     exact = {**request.classifier_options, "compact": False}
     request = replace(request, dimensions=("Probability_",), classifier_options=exact)
     unit = reference.units.horizontal
-    squares: dict[tuple[int, int], list[int]] = {}
+    headers = filter(None, map(header_there, files))
+    is_small = sum(header.count for header in headers) < _FEW_POINTS
+    side = math.inf if is_small else _SQUARE_M / unit
+    squares: dict[tuple[float, float], list[int]] = {}
     for number, place in enumerate(places):
-        key = int(place.x * unit // _SQUARE_M), int(place.y * unit // _SQUARE_M)
+        key = place.x // side, place.y // side
         squares.setdefault(key, []).append(number)
     out: dict[int, Explanation] = {}
     for members in squares.values():
