@@ -19,6 +19,7 @@ from ..base.json_types import JsonObject
 from ..tiling.inputs import LonePoints
 from ..tiling.options import LARGEST_TILE, TILE_POINT, Density, TileGrid
 from ..tiling.tile_records import Part
+from .triangulation import NEAR, SPLIT
 
 Integers = NDArray[np.int64]
 #: Steps of coordinates in their unit: what surveys store is seldom finer.
@@ -158,7 +159,10 @@ class CellDensity(Density):
 
     def read_by(self, side: float, halo_units: float) -> int:
         """Return the points that need as much memory as a tile of this side."""
-        wide = side + 4 * self.options.max_radius / self.unit
+        reach = 2 * self.options.max_radius / self.unit
+        wide = side + 2 * NEAR * reach
+        if wide - self.options.resolution < SPLIT * reach:
+            wide = side + 2 * reach
         points = self._points(wide**2, min(self.points, self.each * wide**2))
         return max(super().read_by(side, 0.0), points)
 

@@ -8,7 +8,9 @@ the first of them is joined to all others.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,9 @@ Integers = NDArray[np.int64]
 Box = tuple[float, float, float, float]
 #: Relative error of a determinant in doubles, rounded up (Shewchuk 1997: about 1.1e-15).
 _ROUNDING = 1e-14
+#: Parts of the reach: within the first points are read at once. Beyond it they are read around
+#: open cells, in pieces that need no wider box, if that is at least the second wide.
+NEAR, SPLIT = 1 / 8, 2.5
 #: How triangles count: their circles reach beyond the known points; they give heights; they are too
 #: wide, so there is no height.
 UNKNOWN, VALID, TOO_WIDE = 0, 1, 2
@@ -126,6 +131,7 @@ def heights_at(
     bounds: Box,
     points_in: Callable[[Box], Integers],
     near: float = 0.0,
+    widest: float = 0.0,
 ) -> NDArray[np.float64]:
     """Return heights (rows, columns) of the triangulation at the centers of cells; NaN for none.
 
@@ -144,11 +150,15 @@ def heights_at(
         Returns the points (n, 3) in a box, different in x and y, in the order of
         :func:`triangulate`.
     near : float
-        Distance around the centers within which points are read first, if not an eighth of `reach`.
+        Distance around the centers within which points are read first, if not :data:`NEAR` of
+        `reach`.
+    widest : float
+        Widest box from which points are read later; if 0, that from which they are read first. It
+        holds if it is at least :data:`SPLIT` times `reach`.
     """
     x, y = centers
     west, south, east, north = bounds
-    distance, out = near or reach / 8, np.full((len(y), len(x)), np.nan)
+    distance, out = near or NEAR * reach, np.full((len(y), len(x)), np.nan)
     box = _around(centers, distance)
     points = points_in(box)
     triangles = triangulate(points[:, :2])
@@ -161,14 +171,23 @@ def heights_at(
     kind = np.where(known, np.where(radius <= reach / 2, VALID, TOO_WIDE), UNKNOWN)
     is_open = _fill(points.astype(np.float64), triangles, kind, x, y, out)
     if distance < reach and np.isfinite([low, high]).any():
-        width = 2 * int(distance / (x[1] - x[0])) + 1 if len(x) > 1 else 1
-        for rows, columns in _groups(is_open, width):
+        step = x[1] - x[0] if len(x) > 1 else reach
+        widest = widest or max(box[2] - box[0], box[3] - box[1])
+        split = partial(
+            _groups, width=2 * int(distance / step) + 1, most=_room(widest, reach) / step
+        )
+        for rows, columns in split(is_open):
             part = x[columns], y[rows]
             is_open[rows, columns] &= _in_hull(part, points_in(_around(part, reach)))
-        for rows, columns in _groups(is_open, width):
+        for rows, columns in split(is_open):
             part, farther = (x[columns], y[rows]), min(3 * distance, reach)
-            out[rows, columns] = heights_at(part, reach, bounds, points_in, farther)
+            out[rows, columns] = heights_at(part, reach, bounds, points_in, farther, widest)
     return out
+
+
+def _room(widest: float, reach: float) -> float:
+    """Return how wide a piece may be that lies with `reach` around it in the widest box."""
+    return widest - 2 * reach if widest >= SPLIT * reach else math.inf
 
 
 def _around(centers: tuple[NDArray[np.float64], NDArray[np.float64]], distance: float) -> Box:
@@ -177,10 +196,21 @@ def _around(centers: tuple[NDArray[np.float64], NDArray[np.float64]], distance: 
     return x[0] - distance, y[0] - distance, x[-1] + distance, y[-1] + distance
 
 
-def _groups(mask: NDArray[np.bool_], width: int) -> list[tuple[slice, slice]]:
-    """Return boxes of cells of a mask, those together that lie within a width of each other."""
-    label = ndimage.label(ndimage.maximum_filter(mask, width))[0]
-    return [box for box in ndimage.find_objects(np.where(mask, label, 0)) if box is not None]
+def _groups(mask: NDArray[np.bool_], width: int, most: float) -> Iterator[tuple[slice, slice]]:
+    """Yield boxes of cells of a mask, of at most so many a side.
+
+    Those within a width of each other are in one, or in neighbors that were cut.
+    """
+    label = np.where(mask, ndimage.label(ndimage.maximum_filter(mask, width))[0], 0)
+    for box in ndimage.find_objects(label):
+        sides = []
+        for side in box:
+            each = max(1, int(min(most, side.stop - side.start)))
+            starts = range(side.start, side.stop, each)
+            sides.append([slice(start, min(start + each, side.stop)) for start in starts])
+        yield from (
+            (rows, columns) for rows, columns in product(*sides) if mask[rows, columns].any()
+        )
 
 
 def _in_hull(
