@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from alsnet_scenes import model_of, random_net
 
+from pdal_stages import load_model
 from pdal_stages.base.asprs import class_name
 from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_points import columns_of_files
@@ -256,6 +257,40 @@ def test_places_of_vector_files_and_other_reference_systems(city, explain, tmp_p
 def test_errors(city, run, words, text):
     code, out, err = run("explain", city, *words)
     assert code == 1 and text in err and not out
+
+
+def test_what_it_cannot_run_is_refused(city, run, tmp_path):
+    model = load_model("standard")
+    model.record_preprocessing([{"type": "filters.smrf"}, {"type": "filters.hag_nn"}])
+    model.save(tmp_path / "pdal.model")
+    words = ["explain", city, 770610, 6277510]
+    code, _, err = run(*words, "--model", tmp_path / "pdal.model")
+    assert code == 1 and "stages of PDAL, which explain does not run" in err
+    (tmp_path / "cloud.txt").write_text("X,Y,Z\n1,2,3\n")
+    code, _, err = run("explain", tmp_path / "cloud.txt", 1, 2)
+    assert code == 1 and "explain reads LAS and LAZ files" in err
+    code, _, err = run(*words, "--json", city)
+    assert code == 1 and city.stat().st_size > 10_000  # an input is no output
+
+
+def test_feet_are_meters_in_the_text(city, explain, tmp_path):
+    """Heights and distances are in meters, whatever the unit of the file."""
+    pyproj = pytest.importorskip("pyproj")
+    las, places = places_of(city, [300])
+    _, (meters,) = explain(city, *places[0])
+    foot = 0.3048
+    feet = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    feet.header.scales, feet.header.offsets = [0.001] * 3, np.floor(las.header.mins / foot)
+    feet.header.add_crs(pyproj.CRS("EPSG:6557+6360"))
+    for name, values in zip("xyz", (las.x, las.y, las.z), strict=True):
+        feet[name] = np.array(values) / foot
+    for name in ("return_number", "number_of_returns", "classification"):
+        feet[name] = np.array(las[name])
+    feet.write(tmp_path / "feet.laz")
+    _, (told,) = explain(tmp_path / "feet.laz", *(places[0] / foot))
+    assert told["point"]["number"] == 300 and told["computed"] == meters["computed"]
+    for name in ("height", "tolerance", "lowest"):
+        assert told["ground"][name] == pytest.approx(meters["ground"][name], abs=0.1)
 
 
 def test_rows_that_are_no_places_are_named(tmp_path):

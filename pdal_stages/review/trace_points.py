@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,33 +205,35 @@ def _verdict(recording: Recording, stage: ApplyModel, place: int, in_file: int) 
 
 def _trace_pass(model: Model, read: PassInputs, at: int) -> PassTrace:
     """Return the contributions of a pass's inputs to a point; those of an earlier pass as one."""
-    codes, single = model.codes_of[read.number], model.passes[read.number]
-    with_codes = partial(zip, codes, strict=True)
+    single = model.passes[read.number]
+
+    def by_class(values: NDArray) -> dict[int, float]:
+        return dict(zip(model.codes_of[read.number], values.tolist(), strict=True))
+
+    probabilities = by_class(read.probabilities[at])
+    if not isinstance(single, FeatureForest):
+        return PassTrace(probabilities, {}, [])
     values = read.values[at : at + 1]
-    shares = dict(with_codes(read.probabilities[at].tolist()))
-    told = single.contributions(values) if isinstance(single, FeatureForest) else None
-    if told is None:
-        return PassTrace(shares, {}, [])
-    assert isinstance(single, FeatureForest)
-    start, added = told
-    names = single.plan.names
-    entries = model.info["passes"][read.number :: -1]
-    percentiles: PercentileTable = next(
-        (table for entry in entries if (table := entry.get("percentiles"))), {}
-    )
-    inputs = [
-        PassInput(
-            name,
-            float(value),
-            dict(with_codes(parts.tolist())),
-            {int(c): share_below(float(value), v) for c, v in percentiles.get(name, {}).items()},
-        )
-        for name, value, parts in zip(names, values[0], added[0], strict=False)
-    ]
+    contributions = single.contributions(values)
+    if contributions is None:
+        return PassTrace(probabilities, {}, [])
+    start, added = contributions
+    names, ranges = single.plan.names, _percentiles(model, read.number)
+    inputs = []
+    for name, value, parts in zip(names, values[0].tolist(), added[0], strict=False):
+        of_name = ranges.get(name, {})
+        below = {int(code): share_below(value, row) for code, row in of_name.items()}
+        inputs.append(PassInput(name, value, by_class(parts), below))
     if single.context is not None:
-        context = added[0, len(names) :].sum(axis=0).tolist()
-        inputs.append(PassInput(SURROUNDINGS, None, dict(with_codes(context)), {}))
-    return PassTrace(shares, dict(with_codes(start.tolist())), inputs)
+        context = by_class(added[0, len(names) :].sum(axis=0))
+        inputs.append(PassInput(SURROUNDINGS, None, context, {}))
+    return PassTrace(probabilities, by_class(start), inputs)
+
+
+def _percentiles(model: Model, number: int) -> PercentileTable:
+    """Return the percentiles of a pass: the first pass of a training has them for all."""
+    entries = model.info["passes"][number::-1]
+    return next((entry["percentiles"] for entry in entries if entry.get("percentiles")), {})
 
 
 def share_below(value: float, percentiles: Sequence[float]) -> float:
@@ -257,9 +258,10 @@ def _own_steps(
     now, steps = verdict.winner, []
     heights = stage.vegetation_heights
     if stage.given_ground and now == GROUND:
-        height = float(recording.heights["Ground"][row]) if recording.heights else 1.0
-        now = now if height else sorted(verdict.probabilities, key=verdict.probabilities.get)[-2]  # type: ignore[arg-type]
-        steps.append(("--ground given: others become ground only near it", now))
+        if recording.heights and not recording.heights["Ground"][row]:
+            others = [each for each in verdict.classes if each != now]
+            now = max(others, key=lambda each: verdict.probabilities[each])
+        steps.append(("--ground given", now))
     if stage.limits is not None or stage.reject_below:
         limit = verdict.limit or 0.0
         sure = np.float32(verdict.probabilities[now]) >= np.float32(limit)
