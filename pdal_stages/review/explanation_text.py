@@ -19,6 +19,8 @@ _OF_FIRST = 10
 #: Given ground that stands higher above the lowest point near, in meters, is doubted: that high
 #: are hedges and low roofs, and not the ground on slopes of up to 45 %.
 _HIGH_M = 2.25
+#: Options of `classify` that run stages after the model.
+_OPTIONS = {"filters.bridges": "--bridges", "filters.polygons": "--polygons"}
 #: Width of the column of names.
 _NAME = 16
 #: Width of a number.
@@ -27,7 +29,7 @@ _NUMBER = 12
 
 def lines(told: Explanation) -> list[str]:
     """Return an explanation as lines of text."""
-    point, after = told.point, told.steps
+    point = told.point
     number = f"point {point.number:,} of {one_line(point.file)}"
     place = f"{point.x:.2f} {point.y:.2f} {point.z:.2f}, {point.distance_m:.2f} m away"
     return [
@@ -47,14 +49,23 @@ def lines(told: Explanation) -> list[str]:
         *([_row("nothing", told.kept)] if told.verdict is None else _verdict(told.verdict)),
         "",
         "WHAT CAME AFTER",
-        *(_row(what, f"then {_class(code)}") for what, code in after),
-        *([] if after else [_row("nothing", "no option that changes classes after the model")]),
+        *_steps(told),
         *(_row("note", note) for note in told.notes),
     ]
 
 
+def _steps(told: Explanation) -> list[str]:
+    """Return what each step after the model made of the class."""
+    before, out = told.in_file if told.verdict is None else told.verdict.winner, []
+    for name, code in told.steps:
+        changes = "keeps the class" if code == before else f"makes it {_class(code)}"
+        out.append(_row(_OPTIONS.get(name, name), changes))
+        before = code
+    return out or [_row("nothing", "no option that changes classes after the model")]
+
+
 def _row(name: str, text: str) -> str:
-    return f"  {name:<{_NAME}} {text}"
+    return f"  {name:<{_NAME}} {text}" if len(name) <= _NAME else f"  {name}: {text}"
 
 
 def _class(code: int) -> str:

@@ -266,8 +266,8 @@ def _own_steps(
         limit = verdict.limit or 0.0
         sure = np.float32(verdict.probabilities[now]) >= np.float32(limit)
         now = now if sure else code
-        sure_from = f"a probability of {limit:.2f} keeps the class" if limit else "no limit for it"
-        steps.append((f"--keep-sure: {sure_from}", now))
+        sure_from = f"from a probability of {limit:.2f} on" if limit else "no limit for it"
+        steps.append((f"--keep-sure ({sure_from})", now))
     if heights:
         steps.append((f"--vegetation-heights {heights[0]:g},{heights[1]:g}", code))
     return steps
