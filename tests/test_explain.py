@@ -259,6 +259,17 @@ def test_errors(city, run, words, text):
     assert code == 1 and text in err and not out
 
 
+def test_where_points_are_too_many_fewer_are_read_and_that_is_said(city, explain, monkeypatch):
+    from pdal_stages.review import explain as module
+
+    _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 2)[:1])
+    text, _ = explain(city, *places[0])
+    assert "were not read" not in text
+    monkeypatch.setattr(module, "_MOST_POINTS", 10_000)
+    text, (each,) = explain(city, *places[0])
+    assert "m were not read, as there are too many" in text and each["computed"] == 2
+
+
 def test_what_it_cannot_run_is_refused(city, run, tmp_path):
     model = load_model("standard")
     model.record_preprocessing([{"type": "filters.smrf"}, {"type": "filters.hag_nn"}])

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.errors import OptionError
-from ..base.las import header_there
+from ..base.las import LasHeader, header_there
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
@@ -19,6 +20,8 @@ from .trace_points import trace_point
 
 #: Files with fewer points together are read once, for all places (not tuned).
 _FEW_POINTS = 5_000_000
+#: Points that are read for one run at most, about: they take 0.4 GB a million.
+_MOST_POINTS = 10_000_000
 #: Side in meters of squares of larger ones whose places are explained in one run (not tuned).
 _SQUARE_M = 256.0
 
@@ -57,7 +60,7 @@ def explain_points(
     exact = {**request.classifier_options, "compact": False}
     request = replace(request, dimensions=("Probability_",), classifier_options=exact)
     unit = reference.units.horizontal
-    headers = filter(None, map(header_there, files))
+    headers = [header for path in files if (header := header_there(path)) and header.count]
     is_small = sum(header.count for header in headers) < _FEW_POINTS
     side = math.inf if is_small else _SQUARE_M / unit
     squares: dict[tuple[float, float], list[int]] = {}
@@ -73,13 +76,34 @@ def explain_points(
             raise OptionError(what, found=types, cure="Take another model")
         reach_m = min(reach_m, sum(ours.stage.halo_m() for ours in pipeline.expanded.ours))
         xy = np.array([places[number][:2] for number in members])
-        reach = reach_m / unit
-        box = [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)]
-        around = Surroundings(files, box)
+        box = _box_that_fits(headers, xy, reach_m / unit)
+        around = Surroundings(files, box.tolist())
         found = [around.nearest(places[number], unit) for number in members]
         rows = np.array([row for row, _ in found])
         recording = Recording(around, request, reference, rows)
         recording.run(pipeline)
+        read_m = unit * float((xy.min(axis=0) - box[:2]).min())
+        if read_m < reach_m - 1.0:
+            recording.notes.append(
+                f"points farther away than {read_m:.0f} m were not read, as there are too many: "
+                "what is wider than that may count otherwise, such as roofs"
+            )
         for at, number in enumerate(members):
             out[number] = trace_point(recording, at, found[at][1])
     return [out[number] for number in range(len(places))]
+
+
+def _box_that_fits(
+    headers: Sequence[LasHeader], xy: NDArray[np.float64], reach: float
+) -> NDArray[np.float64]:
+    """Return west, south, east, north around places (m, 2), with about `_MOST_POINTS` at most."""
+    while True:
+        box = np.concatenate([xy.min(axis=0) - reach, xy.max(axis=0) + reach])
+        points = 0.0
+        for header in headers:
+            low, high = np.reshape(header.box, (2, 2))
+            inside = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
+            points += header.count * np.prod(np.clip(inside / (high - low + 1e-9), 0.0, 1.0))
+        if points <= _MOST_POINTS:
+            return box
+        reach *= 0.9
