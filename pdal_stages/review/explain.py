@@ -63,12 +63,9 @@ def explain_points(
     headers = [header for path in files if (header := header_there(path)) and header.count]
     is_small = sum(header.count for header in headers) < _FEW_POINTS
     side = math.inf if is_small else _SQUARE_M / unit
-    squares: dict[tuple[float, float], list[int]] = {}
-    for number, place in enumerate(places):
-        key = place.x // side, place.y // side
-        squares.setdefault(key, []).append(number)
+    squares = _squares(places, side)
     out: dict[int, Explanation] = {}
-    for members in squares.values():
+    for members in squares:
         pipeline = request.pipeline(files[0], "explained.laz")
         if not pipeline.is_read_here:
             types = ", ".join(stage["type"] for stage in request.stages)
@@ -107,3 +104,11 @@ def _box_that_fits(
         if points <= _MOST_POINTS:
             return box
         reach *= 0.9
+
+
+def _squares(places: Sequence[AskedPlace], side: float) -> list[list[int]]:
+    """Return the numbers of the places in each square."""
+    squares: dict[tuple[float, float], list[int]] = {}
+    for number, place in enumerate(places):
+        squares.setdefault((place.x // side, place.y // side), []).append(number)
+    return list(squares.values())
