@@ -22,6 +22,8 @@ from .trace_points import trace_point
 _FEW_POINTS = 5_000_000
 #: Points that are read for one run at most, about: they take 0.4 GB a million.
 _MOST_POINTS = 10_000_000
+#: How the note on points that are left out begins.
+_TOO_MANY = "there are too many points: wide roofs may count otherwise, as those farther away than"
 #: Side in meters of squares of larger ones whose places are explained in one run (not tuned).
 _SQUARE_M = 256.0
 
@@ -62,47 +64,40 @@ def explain_points(
     unit = reference.units.horizontal
     headers = [header for path in files if (header := header_there(path)) and header.count]
     is_small = sum(header.count for header in headers) < _FEW_POINTS
-    side = math.inf if is_small else _SQUARE_M / unit
-    squares = _squares(places, side)
     out: dict[int, Explanation] = {}
-    for members in squares:
+    for members in _squares(places, math.inf if is_small else _SQUARE_M / unit):
         pipeline = request.pipeline(files[0], "explained.laz")
         if not pipeline.is_read_here:
             types = ", ".join(stage["type"] for stage in request.stages)
             what = "the model's heights are those of stages of PDAL, which explain does not run"
             raise OptionError(what, found=types, cure="Take another model")
-        reach_m = min(reach_m, sum(ours.stage.halo_m() for ours in pipeline.expanded.ours))
+        far = min(reach_m, sum(ours.stage.halo_m() for ours in pipeline.expanded.ours)) / unit
         xy = np.array([places[number][:2] for number in members])
-        box = _box_that_fits(headers, xy, reach_m / unit)
-        around = Surroundings(files, box.tolist())
+        reach = _reach_that_fits(headers, xy, far)
+        box = [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)]
+        around = Surroundings(files, box)
         found = [around.nearest(places[number], unit) for number in members]
         rows = np.array([row for row, _ in found])
         recording = Recording(around, request, reference, rows)
         recording.run(pipeline)
-        read_m = unit * float((xy.min(axis=0) - box[:2]).min())
-        if read_m < reach_m - 1.0:
-            recording.notes.append(
-                f"points farther away than {read_m:.0f} m were not read, as there are too many: "
-                "what is wider than that may count otherwise, such as roofs"
-            )
+        if reach < far:
+            recording.notes.append(f"{_TOO_MANY} {reach * unit:.0f} m are not read")
         for at, number in enumerate(members):
             out[number] = trace_point(recording, at, found[at][1])
     return [out[number] for number in range(len(places))]
 
 
-def _box_that_fits(
-    headers: Sequence[LasHeader], xy: NDArray[np.float64], reach: float
-) -> NDArray[np.float64]:
-    """Return west, south, east, north around places (m, 2), with about `_MOST_POINTS` at most."""
+def _reach_that_fits(headers: Sequence[LasHeader], xy: NDArray[np.float64], reach: float) -> float:
+    """Return how far around places (m, 2) there are about `_MOST_POINTS`, `reach` at most."""
     while True:
-        box = np.concatenate([xy.min(axis=0) - reach, xy.max(axis=0) + reach])
+        first, last = xy.min(axis=0) - reach, xy.max(axis=0) + reach
         points = 0.0
         for header in headers:
             low, high = np.reshape(header.box, (2, 2))
-            inside = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
+            inside = np.minimum(high, last) - np.maximum(low, first)
             points += header.count * np.prod(np.clip(inside / (high - low + 1e-9), 0.0, 1.0))
         if points <= _MOST_POINTS:
-            return box
+            return reach
         reach *= 0.9
 
 
