@@ -51,9 +51,8 @@ SHRUB_SAMPLES = 250
 #: The same of wires and of towers: as many as these are of each class, with those of others 40,000,
 #: keep false wires rare (docs/trials.md).
 WIRE_SAMPLES, TOWER_SAMPLES = 30, 6
-#: What the probability of wires is multiplied by: a third of false wires for a tenth of single
-#: strands (docs/trials.md).
-FACTORS = {WIRE: 0.35}
+#: What the probability of wires is multiplied by (docs/trials.md).
+FACTORS = {WIRE: 0.7}
 #: Points per square meter of the thinnest copies that have these: in thinner ones a wire is a few
 #: points that could be anything.
 LINE_DENSITY = 1.5
@@ -86,6 +85,7 @@ OPTIONS = TrainingOptions(
     prior_weight=0.0,
     passes=2,
     context=("own", "box1", "box4", "columnvotes2", "columnvotes4", "segments6", "lines14"),
+    lines=(WIRE,),
     fill_up=False,
     folds=0,
     voxel=0.25,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from .feature_forest import FeatureEstimator
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
 from .interface import (
     BatchEstimator,
+    Block,
     Estimator,
     InputPlan,
     PointEstimator,
@@ -44,6 +45,7 @@ from .prediction import (
     move_from_ground,
     reject,
 )
+from .straight_lines import REACH, keep_to_lines
 
 #: How many times sparser or denser than those trained on a cloud may be without a warning (not
 #: tuned).
@@ -118,9 +120,14 @@ class Model:
         return float(self.info["voxel"])
 
     @property
+    def lines(self) -> npt.NDArray[np.bool_]:
+        """(classes,) whose points must lie on a line of such points, see :mod:`.straight_lines`."""
+        return np.isin(self.codes, self.info.get("lines", ()))
+
+    @property
     def halo_m(self) -> float:
         """Meters around a tile whose points the tile's results depend on."""
-        return self.plan.halo_m + self.voxel
+        return self.plan.halo_m + self.voxel + REACH * bool(self.lines.any())
 
     @property
     def gives_variance(self) -> bool:
@@ -303,6 +310,13 @@ class Model:
         )
         return dimensions if computed.keys() & dimensions.keys() else {**computed, **dimensions}
 
+    def _blocks(self, request: PredictRequest) -> Iterator[Block]:
+        """Yield the probabilities of the wanted points, block by block."""
+        blocks = partial(classify, self.weighted_passes)
+        if not self.lines.any():
+            return blocks(request)
+        return keep_to_lines(blocks, request, self.lines)
+
     def _classify(
         self,
         work: WorkingCloud,
@@ -314,7 +328,7 @@ class Model:
 
         Warns where the cloud is not as dense as those that the model was trained on.
         """
-        for block in classify(self.weighted_passes, request):
+        for block in self._blocks(request):
             rows_in_cloud, rows_in_block = work.members(block.rows)
             for name, values in decide(block, self.codes, columns).items():
                 columns[name][rows_in_cloud] = values[rows_in_block]
@@ -416,6 +430,8 @@ def assemble(manifest: JsonObject, arrays: model_file.Arrays) -> Model:
     priors = manifest.get("priors")
     if priors is not None and len(priors["factors"]) != len(codes):
         raise ModelError("priors need a factor for each class", found=len(priors["factors"]))
+    if unknown := set(manifest.get("lines", ())) - set(codes):
+        raise ModelError("the model has no such class, which it calls lines", found=min(unknown))
     info = {k: value for k, value in manifest.items() if k not in ("format", "version", "arrays")}
     scores = ("importances", "percentiles", "codes", "factors")
     info["passes"] = [

@@ -448,9 +448,11 @@ def describe_refinement(
     if base.factors is not None:
         scores[-1]["factors"] = base.factors.tolist()
     both = info["densities"], base.info["densities"]
+    lines = {*info.get("lines", ()), *base.info.get("lines", ())}
     low, high = min(each["low"] for each in both), max(each["high"] for each in both)
     return {
         **info,
+        **({"lines": sorted(lines)} if lines else {}),
         "strategy": "multiclass",
         "target": None,
         "background": None,

@@ -219,6 +219,7 @@ class Labeled:
                 **training,
             },
             **more,
+            **({"lines": sorted(options.lines)} if options.lines else {}),
             "densities": {"low": min(positive, default=0.0), "high": max(positive, default=0.0)},
             "voxel": options.voxel,
             "accuracy": {"cross_validation": crossed},

@@ -208,6 +208,14 @@ class TrainingOptions(Settings):
         "(box0.5); segments or lines and a class (segments6, lines14); default: "
         f"{','.join(DEFAULT_CONTEXT)}; with a base {','.join(CONTEXT_OF_BASE)}",
     )
+    lines: Sequence[int] = setting(
+        (),
+        "list",
+        "Classes whose points must lie on a line of such points, as wires do: others get the class "
+        "that is next likely",
+        may_be_empty=True,
+        check=_each(checks.whole, 0, 255),
+    )
     base: Any = setting(
         None,
         "model",

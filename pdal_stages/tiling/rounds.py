@@ -10,9 +10,9 @@ from ..stages.base import Blocks
 from .planned_stage import PlannedStage
 
 #: Meters; stages that look farther see saved results of the stages before them, which would
-#: otherwise be computed again in a wide halo. The shipped model looks 48, bridges 367; in between
+#: otherwise be computed again in a wide halo. The shipped model looks 81, bridges 367; in between
 #: the value was not tuned.
-_FAR_M = 64.0
+_FAR_M = 96.0
 
 
 class RoundStage(NamedTuple):
