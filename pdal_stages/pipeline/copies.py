@@ -22,6 +22,7 @@ from ..base.messages import shorten
 from ..stages.points import NO_POINT_MATCHES, SELECTED
 from ..stages.registry import stage_types
 from ..stages.where_expression import Expression
+from . import pdal as pdal_env
 from .inputs_outputs import LAS_READERS, is_las
 from .runtime import ExpandedStage
 from .spatial_reference import records_for, reference_of_las
@@ -139,16 +140,21 @@ def write_copy(copy: LasCopy, target: Path, values: Mapping[str, NDArray]) -> No
 FLOATS = {"float64": "double", "float32": "float"}
 
 
+#: The first version of PDAL whose option ``extra_dims`` counts before a record.
+_OPTION_FIRST = (2, 9, 0)
+
+
 def layout_read_by(reader: StageJson, path: str) -> Layout:
     """Return the layout of a file with the names that its reader gives to extra bytes, as PDAL.
 
-    ``extra_dims`` names those that no record describes; ``ignore_vlr`` may leave that record out,
-    which in LAS 1.0 to 1.3 counts with ``use_eb_vlr`` alone.
+    ``extra_dims`` names those that no record describes, and from PDAL 2.9 on all; ``ignore_vlr``
+    may leave that record out, which in LAS 1.0 to 1.3 counts with ``use_eb_vlr`` alone.
     """
     layout = Layout.of_file(path)
     named = str(reader.get("extra_dims", "")).strip()
     is_read = layout.header.minor >= 4 or str(reader.get("use_eb_vlr", "")).lower() == "true"
-    if not named or (layout.described and is_read and _DESCRIPTIONS not in _ignored(reader)):
+    is_read = is_read and layout.described and _DESCRIPTIONS not in _ignored(reader)
+    if not named or (is_read and pdal_env.version() < _OPTION_FIRST):
         return layout
     pairs = (part.split("=") for part in named.replace(" ", "").split(","))
     data = b"".join(describe(name, number_type(kind)) for name, kind in pairs)
