@@ -153,7 +153,7 @@ def layout_read_by(reader: StageJson, path: str) -> Layout:
     layout = Layout.of_file(path)
     named = str(reader.get("extra_dims", "")).strip()
     is_read = layout.header.minor >= 4 or str(reader.get("use_eb_vlr", "")).lower() == "true"
-    is_read = is_read and layout.described and _DESCRIPTIONS not in _ignored(reader)
+    is_read = is_read and bool(layout.described) and _DESCRIPTIONS not in _ignored(reader)
     if not named or (is_read and pdal_env.version() < _OPTION_FIRST):
         return layout
     pairs = (part.split("=") for part in named.replace(" ", "").split(","))
