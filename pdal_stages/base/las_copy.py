@@ -223,7 +223,8 @@ class LasCopy:
         if self._encoder is None:
             self._file.write(new)
         elif len(new):
-            self._encoder.compress_many(new.reshape(-1))
+            with _compressing():
+                self._encoder.compress_many(new.reshape(-1))
         self.count += len(new)
 
     def _check_codes(self, codes: NDArray) -> None:
@@ -242,7 +243,8 @@ class LasCopy:
     def _finish(self) -> None:
         header, file = self.layout.header, self._file
         if self._encoder is not None:
-            self._encoder.done()
+            with _compressing():
+                self._encoder.done()
             self._encoder = None  # which holds the file
         file.seek(0, 2)
         if self.count != header.count:
@@ -301,6 +303,18 @@ class LasCopy:
         while left > 0 and (data := source.read(min(left, 1 << 22))):
             self._file.write(data)
             left -= len(data)
+
+
+@contextlib.contextmanager
+def _compressing() -> Iterator[None]:
+    """Report the encoder's errors, which write to the file, as those of the output."""
+    import lazrs
+
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        what, cure = "the output file could not be written", "Make room on the disk"
+        raise StageError(what, found=str(error), cure=cure) from None
 
 
 def refuse_narrow(source: str, layout: Layout, added: Mapping[str, np.dtype]) -> None:

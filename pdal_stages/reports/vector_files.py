@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,35 +91,39 @@ def write_layers(
     return files
 
 
-def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
-    """Write a layer and count its features, since GDAL ignores some failed writes."""
-    pyogrio, shapely = vector("pyogrio"), vector("shapely")
-    layer_name = name if driver == MANY_LAYERS else None
+@contextlib.contextmanager
+def _writing() -> Iterator[None]:
+    """Leave out GDAL's warnings about what is right here, and report its errors as the file's."""
+    errors = vector("pyogrio").errors
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided")  # as the points have none
             warnings.filterwarnings("ignore", "Passed SRS uses EPSG")
             # GDAL takes an empty shapefile of lines for one with measures.
             warnings.filterwarnings("ignore", "Measured .M. geometry types")
-            pyogrio.raw.write(
-                path,
-                shapely.to_wkb(np.array(layer.shapes, object)),
-                list(layer.columns.values()),
-                list(layer.columns),
-                driver=driver,
-                geometry_type=layer.kind,
-                crs=horizontal_wkt(wkt) or None,
-                layer=layer_name,
-                **({"VERSION": "1.2"} if layer_name else {}),  # GDAL before 3.7 warns of others
-            )
-            info = pyogrio.read_info(path, layer=layer_name, force_feature_count=True)
-    except (
-        pyogrio.errors.DataSourceError,
-        pyogrio.errors.DataLayerError,
-        pyogrio.errors.CRSError,
-    ) as error:
+            yield
+    except (errors.DataSourceError, errors.DataLayerError, errors.CRSError) as error:
         what, cure = "the vector file could not be written", "Is there room on the disk?"
         raise StageError(what, found=str(error), cure=cure) from None
+
+
+def _write(path: Path, name: str, layer: Layer, driver: str, wkt: str) -> None:
+    """Write a layer and count its features, since GDAL ignores some failed writes."""
+    pyogrio, shapely = vector("pyogrio"), vector("shapely")
+    layer_name = name if driver == MANY_LAYERS else None
+    with _writing():
+        pyogrio.raw.write(
+            path,
+            shapely.to_wkb(np.array(layer.shapes, object)),
+            list(layer.columns.values()),
+            list(layer.columns),
+            driver=driver,
+            geometry_type=layer.kind,
+            crs=horizontal_wkt(wkt) or None,
+            layer=layer_name,
+            **({"VERSION": "1.2"} if layer_name else {}),  # GDAL before 3.7 warns of others
+        )
+        info = pyogrio.read_info(path, layer=layer_name, force_feature_count=True)
     if info["features"] != len(layer.shapes):
         lost = f"{info['features']:,} of {len(layer.shapes):,} {name}"
         what = "the vector file could not be written completely"
@@ -178,4 +183,5 @@ def _write_styles(path: Path, styles: Mapping[str, str]) -> None:
         for values in zip(*rows, strict=True)
     ]
     options = {"layer": "layer_styles", "driver": MANY_LAYERS, "FID": "id"}
-    vector("pyogrio").raw.write(path, None, columns, names.split(), **options)
+    with _writing():
+        vector("pyogrio").raw.write(path, None, columns, names.split(), **options)

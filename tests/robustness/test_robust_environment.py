@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -146,6 +147,27 @@ def test_disk_full(command, tmp_path, write_las, suffix):
         path = job(tmp_path, source, HAG, small / f"out.{suffix}")
         command.refused(["pipeline", path], f"out.{suffix}", "ake room")
         assert not list(small.iterdir())
+
+
+@pytest.mark.parametrize("room_kib", [20, 60, 100, 120])
+@pytest.mark.parametrize("name", ["classified.laz", "review.gpkg"])
+def test_no_room_for_what_others_write(command, tmp_path, request, name, room_kib):
+    """lazrs and GDAL have errors of their own, wherever the room ends."""
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room_kib * 1024, room_kib * 1024))
+
+    verb = "classify" if name.endswith("laz") else "review"
+    if verb == "review":
+        pytest.importorskip("pyogrio")
+    source = request.config.rootpath / "tests" / "data" / "city.laz"
+    done = command.process(verb, source, tmp_path / name, preexec_fn=limit)
+    if done.code:
+        command.refused(done, "could not be written", "room")
+        assert not (tmp_path / name).exists()
+    else:
+        assert (tmp_path / name).stat().st_size <= room_kib * 1024
 
 
 # ---- locale and names --------------------------------------------------------------------------------------------
