@@ -233,10 +233,18 @@ def test_a_point_and_a_line(count, tmp_path):
 
 
 def test_bad_input(cloud, tmp_path):
-    for text, match in (("x,y,z\n1,2,3\n1,2\n", "line 3"), ("", "no control points")):
+    for text, match in (
+        ("x,y,z\n1,2,3\n1,2\n", "line 3"),
+        ("", "no control points"),
+        ("1,2,inf\n", "line 1"),
+        ("1,2,3\n4,nan,5\n", "line 2"),
+        ("a,b,c\n", "no control points"),
+    ):
         (tmp_path / "c.csv").write_text(text)
         with pytest.raises(StageError, match=match):
             read_control(str(tmp_path / "c.csv"))
+    (tmp_path / "c.csv").write_text('"id","X","Y","Z"\n7,1,2,3\n')
+    assert read_control(str(tmp_path / "c.csv")) == [(1.0, 2.0, 3.0, "7")]
     with pytest.raises(OptionError, match="--void"):
         write_report([str(cloud)], str(tmp_path / "r.html"), void=0.0)
     with pytest.raises(StageError, match="would replace a LAS"):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ..base.errors import OptionError, StageError
+from ..base.point_rows import read_point_rows
 from ..base.vector import reading, vector
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.spatial_reference import reference_of_file
@@ -41,27 +41,44 @@ def read_places(
             found=" ".join(map(str, numbers)) or "none",
             cure="For example: pdal-stages explain cloud.laz 652034 6862010, or --points FILE",
         )
-    return _transform(places, crs, cloud) if crs else places
+    places = _transform(places, crs, cloud) if crs else places
+    for place in places:
+        if not all(math.isfinite(value) for value in place[:3] if value is not None):
+            raise OptionError(
+                "a place is not of finite numbers in the cloud's reference system",
+                found=" ".join(f"{value:.12g}" for value in place[:3] if value is not None),
+                cure="Check the order of X and Y, and --crs",
+            )
+    return places
 
 
 def _read_csv(path: str) -> list[AskedPlace]:
-    """Return the first two or three numbers of each row; the first row may be a heading."""
-    with reading(path, "the points cannot be read", "Give rows of x,y or x,y,z") as name:
-        rows = np.genfromtxt(name, delimiter=",", encoding="utf-8-sig", ndmin=2)[:, :3]
-    rows = rows[int(len(rows) and np.isnan(rows[0, :2]).any()) :]
-    if np.isnan(rows[:, :2]).any():
-        number = int(np.argmax(np.isnan(rows[:, :2]).any(axis=1)))
-        raise StageError(f"point {number + 1} is not x,y or x,y,z", where=path)
-    return [AskedPlace(x, y, *(v for v in z if v == v)) for x, y, *z in rows.tolist()]
+    """Return the points of a CSV file."""
+    rows = read_point_rows(path, "point", needs_z=False)
+    return [AskedPlace(row.x, row.y, row.z) for row in rows]
 
 
 def _read_vector(path: str) -> tuple[list[AskedPlace], str]:
-    """Return the points of the first layer of a vector file, and its reference system."""
+    """Return the points of the first layer of a vector file, and its reference system.
+
+    A feature must be one point, so that explanations follow its order.
+    """
+    shapely, places = vector("shapely"), []
     with reading(path) as name:
         info, _, geometry, _ = vector("pyogrio").raw.read(name, columns=[])
-        points = vector("shapely").get_parts(vector("shapely").from_wkb(geometry))
-        coordinates = [point.coords[0] for point in points]
-        places = [AskedPlace(xyz[0], xyz[1], *xyz[2:3]) for xyz in coordinates]
+        shapes = shapely.from_wkb(geometry)
+        for number, shape in enumerate(shapes, 1):
+            parts = [] if shape is None or shape.is_empty else [*shapely.get_parts([shape])]
+            if len(parts) != 1 or parts[0].geom_type != "Point":
+                kind = "no geometry" if not parts else f"a {shape.geom_type}"
+                raise StageError(
+                    "a feature is not one point",
+                    where=f"{path}, feature {number}",
+                    found=kind,
+                    cure="Give a layer of points",
+                )
+            x, y, *z = parts[0].coords[0]
+            places.append(AskedPlace(x, y, z[0] if z and math.isfinite(z[0]) else None))
     return places, str(info["crs"] or "")
 
 

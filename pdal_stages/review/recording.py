@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import StageError
+from ..base.errors import NoTerrainError, StageError
 from ..base.grid import GridWindow
+from ..base.las_check import beyond_box
 from ..base.las_points import USUAL, Layout, RecordColumns, SomeRows, read_records
 from ..classifier.interface import PassInputs
 from ..classifier.model import OTHER_DENSITY
@@ -38,6 +39,19 @@ _MARGIN_M = 32.0
 _FARTHEST_M = 2.0
 #: ... or in mean distances between points, where these are larger.
 _FARTHEST_SPACINGS = 3.0
+#: Points of a file that are compared with the box in its header.
+_PROBED = 1000
+
+
+def _is_in_its_box(path: str, layout: Layout) -> bool:
+    """Return whether the first points of a file lie in the box that its header names.
+
+    Not all are read for that: a file whose box is wrong has mostly no point in it.
+    """
+    for records in read_records(path, layout, 0, min(_PROBED, layout.header.count), only=["X"]):
+        x, y = (layout.column(records, axis) for axis in "XY")
+        return beyond_box(path, (x.min(), y.min(), x.max(), y.max())) is None
+    return True
 
 
 class Surroundings(Mapping[str, NDArray]):
@@ -53,7 +67,8 @@ class Surroundings(Mapping[str, NDArray]):
         self._layouts = {n: Layout.of_file(path) for n, path in enumerate(files)}
         for index, layout in list(self._layouts.items()):
             x0, y0, x1, y1 = layout.header.box
-            if x0 > east or x1 < west or y0 > north or y1 < south:
+            apart = x0 > east or x1 < west or y0 > north or y1 < south
+            if apart and _is_in_its_box(files[index], layout):
                 del self._layouts[index]
         first = []
         for index, layout in self._layouts.items():
@@ -117,9 +132,14 @@ class Surroundings(Mapping[str, NDArray]):
             if away[row] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing, place.doubtful_m):
                 return row, float(away[row])
             found = f"the nearest is {away[row]:.1f} m away"
+            flat = unit * np.hypot(*(xyz[:, :2] - asked[:2]).T)
+            if len(asked) == 3 and flat.min() <= _FARTHEST_M:
+                found += (
+                    f"; without Z {flat.min():.1f} m, at a height of {xyz[flat.argmin(), 2]:.2f}"
+                )
         raise StageError(
             "there is no point near this place",
-            where=" ".join(f"{value:.2f}" for value in asked),
+            where=" ".join(f"{value:.12g}" for value in asked),
             found=found,
             cure="Give X and Y in the cloud's reference system, or name theirs with --crs",
         )
@@ -153,7 +173,14 @@ class Recording:
         first = next(n for n, each in enumerate(ours) if isinstance(each.stage, ApplyModel))
         columns, wkt = self.around, self.reference.wkt
         known = selection(self.request.where, columns)
-        seen = run_stages(ours[:first], columns, wkt, known, self._keep_classes)
+        try:
+            seen = run_stages(ours[:first], columns, wkt, known, self._keep_classes)
+        except NoTerrainError as error:
+            raise NoTerrainError(
+                f"around the place {error.what}",
+                found=f"{len(self.around.number):,} points, all that are read",
+                cure="Explain places nearer to ground, or leave --ground given out",
+            ) from None
         reach = (sum(each.stage.halo_m() for each in ours[first:]) + _MARGIN_M) / unit
         x, y = (columns[axis] for axis in "XY")
         near = np.ones(len(x), np.bool_)

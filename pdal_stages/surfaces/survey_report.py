@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -19,6 +18,7 @@ from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, write_json, write_whole
 from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
+from ..base.point_rows import read_point_rows
 from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.jobs import Job
@@ -92,23 +92,11 @@ def write_report(
 
 def read_control(path: str) -> list[Control]:
     """Return the control points of a CSV file: x, y, z and a name, with or without a heading."""
-    points: list[Control] = []
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = [*csv.reader(file)]
-    except (OSError, UnicodeError) as error:
-        raise StageError("the control points cannot be read", where=path, found=error) from None
-    for number, row in enumerate(rows, 1):
-        try:
-            x, y, z = map(float, row[:3])
-            points.append((x, y, z, ",".join(row[3:]).strip() or str(len(points) + 1)))
-        except ValueError:
-            if row and number > 1:
-                what, place = "a control point is not three numbers", f"{path}, line {number}"
-                raise StageError(what, where=place, found=",".join(row)) from None
-    if not points:
-        raise StageError("the file has no control points", where=path)
-    return points
+    rows = read_point_rows(path, "control point", needs_z=True)
+    numbered = enumerate(rows, 1)
+    return [
+        (row.x, row.y, float(row.z or 0.0), row.name or str(number)) for number, row in numbered
+    ]
 
 
 def _measure(

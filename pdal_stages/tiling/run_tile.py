@@ -408,7 +408,11 @@ def run_tile(
                 break
         if result is None:
             what = "no terrain: no point near the tile can be part of it"
-            raise NoTerrainError(what, found=f"within {halo.used_m:.0f} m")
+            raise NoTerrainError(
+                what,
+                found=f"within {halo.used_m:.0f} m",
+                cure="Take larger tiles, or run without --tile; given ground must lie near each",
+            )
         record = vars(_describe(halo, pieces, result))
         if outputs is None:
             return record | _save(halo, result, target)
