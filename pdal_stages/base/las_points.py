@@ -11,7 +11,7 @@ import functools
 import operator
 import os
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .columns import LazyColumns
 from .errors import DimensionError, StageError
 from .las import POINT_BYTES, POINTWISE, LasHeader, laszip_record, read_header, records_of
 
@@ -396,7 +397,7 @@ USUAL = ("X", "Y", "Z", "Classification", "ReturnNumber", "NumberOfReturns", "Wi
 
 
 @dataclass(eq=False)
-class LasColumns(Mapping[str, NDArray]):
+class LasColumns(LazyColumns):
     """The dimensions of a file by name, each read when it is asked for and then kept.
 
     Coordinates are kept as the whole numbers of the file, in half the memory.
@@ -405,6 +406,11 @@ class LasColumns(Mapping[str, NDArray]):
     path: str
     layout: Layout
     _read: dict[str, NDArray] = field(default_factory=dict)
+
+    @property
+    def names(self) -> Collection[str]:
+        """Return the names of the dimensions."""
+        return self.layout.names
 
     def __getitem__(self, name: str) -> NDArray:
         """Return a dimension (n,)."""
@@ -428,18 +434,6 @@ class LasColumns(Mapping[str, NDArray]):
             at += len(records)
         self._read |= new
 
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        return iter(self.layout.names)
-
-    def __len__(self) -> int:
-        """Return the number of dimensions."""
-        return len(self.layout.names)
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether there is a dimension, without reading it."""
-        return name in self.layout.names
-
 
 def columns_of_files(paths: Sequence[str]) -> RecordColumns:
     """Return the dimensions of all points of files, one after the other."""
@@ -452,35 +446,16 @@ def columns_of_files(paths: Sequence[str]) -> RecordColumns:
 
 
 @dataclass(eq=False)
-class SomeRows(Mapping[str, NDArray]):
-    """Dimensions of some points, each taken when it is asked for."""
-
-    columns: Mapping[str, NDArray]
-    rows: NDArray[np.int64]
-
-    def __getitem__(self, name: str) -> NDArray:
-        """Return a dimension (n,)."""
-        return self.columns[name][self.rows]
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        return iter(self.columns)
-
-    def __len__(self) -> int:
-        """Return the number of dimensions."""
-        return len(self.columns)
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether there is a dimension, without taking it."""
-        return name in self.columns
-
-
-@dataclass(eq=False)
-class RecordColumns(Mapping[str, NDArray]):
+class RecordColumns(LazyColumns):
     """The dimensions of records of several files together, by name; 0 where a file has none."""
 
     parts: Sequence[tuple[Layout, NDArray]]
     _made: dict[str, NDArray] = field(default_factory=dict)
+
+    @cached_property
+    def names(self) -> Collection[str]:  # type: ignore[override]
+        """Return the names of the dimensions, in the order of the files."""
+        return dict.fromkeys(name for layout, _ in self.parts for name in layout.names).keys()
 
     def __getitem__(self, name: str) -> NDArray:
         """Return a dimension (n,)."""
@@ -498,19 +473,3 @@ class RecordColumns(Mapping[str, NDArray]):
                 ]
             )
         return self._made[name]
-
-    @cached_property
-    def _names(self) -> list[str]:
-        return list(dict.fromkeys(name for layout, _ in self.parts for name in layout.names))
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        """Return the number of dimensions."""
-        return len(self._names)
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether there is a dimension, without making it."""
-        return name in self._names

@@ -6,16 +6,17 @@ model computes the points in question, and what these depend on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.columns import LazyColumns, SomeRows
 from ..base.errors import NoTerrainError, StageError
 from ..base.grid import GridWindow
 from ..base.las_check import beyond_box
-from ..base.las_points import USUAL, Layout, RecordColumns, SomeRows, read_records
+from ..base.las_points import USUAL, Layout, RecordColumns, read_records
 from ..classifier.interface import PassInputs
 from ..classifier.model import OTHER_DENSITY
 from ..features.cell_means import density
@@ -54,7 +55,7 @@ def _is_in_its_box(path: str, layout: Layout) -> bool:
     return True
 
 
-class Surroundings(Mapping[str, NDArray]):
+class Surroundings(LazyColumns):
     """The dimensions of the points of files within a box, each read when it is asked for.
 
     Those that every run needs are read in the first pass; another one takes a pass of its own.
@@ -87,6 +88,11 @@ class Surroundings(Mapping[str, NDArray]):
         self.file = np.repeat(np.fromiter(self._rows, np.int64), counts)
         self.number = np.concatenate([np.zeros(0, np.int64), *self._rows.values()])
 
+    @property
+    def names(self) -> Collection[str]:
+        """Return the names of the dimensions."""
+        return self._first.names
+
     def __getitem__(self, name: str) -> NDArray:
         """Return a dimension (n,)."""
         if name in _READ or name not in self:
@@ -101,18 +107,6 @@ class Surroundings(Mapping[str, NDArray]):
                     at += len(records)
             self._more[name] = RecordColumns(parts)[name]
         return self._more[name]
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        return iter(self._first)
-
-    def __len__(self) -> int:
-        """Return the number of dimensions."""
-        return len(self._first)
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether there is a dimension, without reading it."""
-        return name in self._first
 
     def nearest(self, place: AskedPlace, unit: float) -> tuple[int, float]:
         """Return the row of the nearest point and its distance in meters; StageError if far.

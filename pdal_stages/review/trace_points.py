@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import GROUND, TERRAIN
+from ..base.columns import SomeRows
 from ..base.dimensions import opening
 from ..base.grid import cell_numbers
-from ..base.las_points import SomeRows
 from ..classifier.feature_forest import FeatureForest
 from ..classifier.interface import PassInputs
 from ..classifier.model import Model

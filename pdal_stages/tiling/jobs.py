@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.checks import strict_json
+from ..base.columns import LazyColumns
 from ..base.errors import StageError
 from ..base.files import make_own_folder, try_lock, whole_files
 from ..base.hashing import digest_of_file
@@ -376,7 +377,7 @@ def load_arrays(path: str | Path, only: Collection[str] | None = None) -> dict[s
         return {name: file[name] for name in file.files if only is None or name in only}
 
 
-class SavedArrays(Mapping[str, NDArray]):
+class SavedArrays(LazyColumns):
     """The arrays of a file by name, each of which is read when it is asked for, and not kept."""
 
     def __init__(self, path: str | Path) -> None:
@@ -385,17 +386,14 @@ class SavedArrays(Mapping[str, NDArray]):
         with _opened(path) as file:
             self._names = file.files
 
+    @property
+    def names(self) -> Collection[str]:
+        """Return the names of the arrays."""
+        return self._names
+
     def __getitem__(self, name: str) -> NDArray:
         """Return an array."""
         return load_arrays(self._path, [name])[name]
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        """Return how many arrays there are."""
-        return len(self._names)
 
 
 @contextlib.contextmanager

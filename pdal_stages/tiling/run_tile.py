@@ -29,11 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import LEGACY_LIMIT
+from ..base.columns import SomeRows
 from ..base.distinct import count_shared
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.json_types import JsonObject, StageJson
 from ..base.las_copy import LasCopy
-from ..base.las_points import RecordColumns, SomeRows
+from ..base.las_points import RecordColumns
 from ..base.messages import shorten
 from ..pipeline.copies import selection
 from ..pipeline.pdal_facts import check_class_codes
