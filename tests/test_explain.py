@@ -109,6 +109,12 @@ def test_text_is_a_screen_and_names_what_the_model_saw(city, explain):
     assert "WHAT DIFFERS" not in text and "surroundings: pass 1, here" in text
 
 
+def test_against_names_the_class_that_is_compared(city, explain):
+    _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 6)[:1])
+    text, (each,) = explain(city, *places[0], "--against", "2")
+    assert each["verdict"]["rival"] == 2 and "For Building, against Ground" in text
+
+
 # ---- planted errors ------------------------------------------------------------------------------
 
 
@@ -118,7 +124,34 @@ def test_a_class_changed_by_hand_or_by_an_option_after_the_model(city, explain, 
     las.write(tmp_path / "edited.laz")
     text, (each,) = explain(tmp_path / "edited.laz", *places[0])
     assert each["in_file"] == 6 and each["computed"] == 5 and each["verdict"]["rival"] == 6
-    assert "the class was changed afterwards: by hand" in text
+    assert (
+        "the class was changed afterwards: by hand" in text and "reasons          not shown" in text
+    )
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [(9, "by hand, by --polygons,"), (1, "--keep-sure"), (3, "--vegetation-heights")],
+)
+def test_options_that_give_a_class_are_named(city, explain, tmp_path, code, text):
+    las, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 5)[:1])
+    las.classification[np.flatnonzero(las.classification == 5)[:1]] = code
+    las.write(tmp_path / "edited.laz")
+    assert text in explain(tmp_path / "edited.laz", *places[0])[0]
+
+
+def test_echoes_from_below_that_are_left_in_are_doubted(city, explain, tmp_path):
+    las, _ = places_of(city, [])
+    x, y, codes = (np.array(values) for values in (las.x, las.y, las.classification))
+    row = np.flatnonzero(codes == 2)[len(codes) // 4]
+    away = np.hypot(x - x[row], y - y[row])
+    echoes = np.flatnonzero((away < 6.0) & (away > 0.5) & (codes == 2))[::20]
+    las.Z[echoes] -= round(5.0 / las.header.scales[2])
+    las.write(tmp_path / "echoes.laz")
+    _, places = places_of(tmp_path / "echoes.laz", [row])
+    text, (each,) = explain(tmp_path / "echoes.laz", *places[0], "--no-noise")
+    assert each["ground"]["lower"] == np.count_nonzero(away[echoes] <= 5.0) > 0
+    assert ("echoes from below the ground?" in text) != each["ground"]["is_ground"]
 
 
 def test_another_model_or_another_ground(city, explain, tmp_path):
@@ -129,7 +162,10 @@ def test_another_model_or_another_ground(city, explain, tmp_path):
     assert "and the model is another: --model" in explain(tmp_path / "other.laz", *places[0])[0]
     las.HeightAboveGround[row] -= 2.0
     las.write(tmp_path / "ground.laz")
-    assert "so the ground is another: --ground" in explain(tmp_path / "ground.laz", *places[0])[0]
+    assert (
+        "so the ground of that run was another: --ground"
+        in explain(tmp_path / "ground.laz", *places[0])[0]
+    )
 
 
 def test_given_ground_that_was_edited_is_seen_beside_the_lowest_point(city, explain, tmp_path):
@@ -202,7 +238,7 @@ def test_a_model_with_percentiles_shows_where_values_lie(city, explain, tmp_path
     shares = [entry["below"] for entry in last["inputs"][:-1]]
     assert all(set(share) == {"5", "6"} for share in shares) and len(each["verdict"]["passes"]) == 3
     assert all(0.0 <= value <= 1.0 for share in shares for value in share.values())
-    assert "which share of the training's points" in text and " %" in text
+    assert "the share of the training's points" in text and " %" in text
 
 
 # ---- files and places ----------------------------------------------------------------------------
@@ -252,6 +288,7 @@ def test_places_of_vector_files_and_other_reference_systems(city, explain, tmp_p
         ([], "a place is X Y or X Y Z"),
         (["770610", "6277510", "--model", "none"], "there is no such model file"),
         (["770610", "6277510", "90"], "the nearest is"),
+        (["770610", "6277510", "--against", "9"], "the model cannot compare with class 9"),
         (["1", "2", "--crs", "EPSG:4326"], "the cloud has no reference system"),
     ],
 )

@@ -348,7 +348,7 @@ def test_the_way_of_a_tile(algorithm, session, ready_town, run_job, tmp_path):
     place = laspy.read(cloud).xyz[100]
     asked = {"INPUT": cloud, "POINT": f"{place[0]},{place[1]}", "PAGE": out / "why.html"}
     output = algorithm("explain", **asked, NOISE=0)
-    assert "WHAT THE MODEL SAW" in output and "computed now" in (out / "why.html").read_text()
+    assert "WHAT THE MODEL SEES" in output and "computed now" in (out / "why.html").read_text()
     marked = {"BEFORE": cloud, "AFTER": ready_town, "OUTPUT": out / "k.laz", "AROUND": 2}
     output = algorithm("corrections", code=1, **marked, AREA=out / "r.gpkg")
     assert "no patch is marked as checked" in output and not (out / "k.laz").exists()

@@ -36,7 +36,7 @@ NAMES = {code: name for code, (name, _) in _CLASSES.items()}
 
 #: Codes of noise points: below the ground (7) and in the air (18).
 NOISE = (7, 18)
-#: Ground.
+UNCLASSIFIED = 1  #: processed, without a class
 GROUND = 2
 LOW_VEGETATION = 3
 MEDIUM_VEGETATION = 4

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..base.asprs import GROUND
+from ..base.asprs import GROUND, UNCLASSIFIED
 from ..base.errors import OptionError
 from ..base.json_types import JsonObject
 from ..base.messages import Report
@@ -22,9 +22,6 @@ from ..features.point_grid import CellGrid, build_grid
 from ..features.voxels import Members, Representatives
 from .calibration import ReliabilityLimits
 from .interface import Block, Observe, PassInputs
-
-#: The class of a rejected point where its old class is not known: ASPRS "Unclassified".
-UNCLASSIFIED = 1
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,8 @@ def add_commands(parser: Parser) -> None:
     add("--points", metavar="FILE", default="", help=points)
     add("--crs", default="", help="Reference system of X and Y (default: the cloud's)")
     add("--json", metavar="FILE", default="", help="Write JSON, too; - prints it instead of text")
+    against = "Class that the one found is compared with (default: the file's, or the next likely)"
+    add("--against", type=int, metavar="CODE", help=against)
     add_request_options(add)
 
     what = "Mark points that a person corrected or confirmed, to train on"
@@ -109,7 +111,9 @@ def _explain(options: argparse.Namespace) -> None:
     places = read_places(options.cloud, options.place, options.points, options.crs)
     output = [Output(options.json, "json", JSON)] if options.json not in ("", "-") else []
     check_outputs(output, [options.cloud, *filter(None, [options.points])])
-    explained = explain_points([options.cloud], places, request_of(options))
+    explained = explain_points(
+        [options.cloud], places, request_of(options), against=options.against
+    )
     if options.json != "-":
         print("\n\n".join("\n".join(lines(each)) for each in explained))
     if options.json:

@@ -13,7 +13,9 @@ from ..base.errors import OptionError
 from ..base.las import LasHeader, header_there
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.inputs_outputs import input_files, is_las
+from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import check_one_reference, reference_of_file
+from ..stages.apply_model import ApplyModel
 from .explanation import AskedPlace, Explanation
 from .recording import Recording, Surroundings
 from .trace_points import trace_point
@@ -33,6 +35,7 @@ def explain_points(
     places: Sequence[AskedPlace],
     request: ClassifyRequest,
     reach_m: float = math.inf,
+    against: int | None = None,
 ) -> list[Explanation]:
     """Explain the points nearest to places.
 
@@ -46,6 +49,9 @@ def explain_points(
         How the points are classified.
     reach_m : float
         Points farther away are not read, though the stages may look farther: for hints.
+    against : int, optional
+        Class of the model that the one found is compared with; by default the class of the file,
+        where the model has it and finds another one, else the one that is next likely.
 
     Raises
     ------
@@ -66,11 +72,7 @@ def explain_points(
     is_small = sum(header.count for header in headers) < _FEW_POINTS
     out: dict[int, Explanation] = {}
     for members in _squares(places, math.inf if is_small else _SQUARE_M / unit):
-        pipeline = request.pipeline(files[0], "explained.laz")
-        if not pipeline.is_read_here:
-            types = ", ".join(stage["type"] for stage in request.stages)
-            what = "the model's heights are those of stages of PDAL, which explain does not run"
-            raise OptionError(what, found=types, cure="Take another model")
+        pipeline = _checked_pipeline(request, files[0], against)
         far = min(reach_m, sum(ours.stage.halo_m() for ours in pipeline.expanded.ours)) / unit
         xy = np.array([places[number][:2] for number in members])
         reach = _reach_that_fits(headers, xy, far)
@@ -83,8 +85,24 @@ def explain_points(
         if reach < far:
             recording.notes.append(f"{_TOO_MANY} {reach * unit:.0f} m are not read")
         for at, number in enumerate(members):
-            out[number] = trace_point(recording, at, found[at][1])
+            out[number] = trace_point(recording, at, found[at][1], against)
     return [out[number] for number in range(len(places))]
+
+
+def _checked_pipeline(request: ClassifyRequest, path: str, against: int | None) -> Pipeline:
+    """Return the stages of a request; OptionError where they cannot be explained."""
+    pipeline = request.pipeline(path, "explained.laz")
+    if not pipeline.is_read_here:
+        types = ", ".join(stage["type"] for stage in request.stages)
+        what = "the model's heights are those of stages of PDAL, which explain does not run"
+        raise OptionError(what, found=types, cure="Take another model")
+    stages = [ours.stage for ours in pipeline.expanded.ours]
+    codes = {c for each in stages if isinstance(each, ApplyModel) for c, _ in each.model.classes}
+    if against is not None and against not in codes:
+        known = f"classes {', '.join(map(str, sorted(codes)))}"
+        what = f"the model cannot compare with class {against}, which it does not know"
+        raise OptionError(what, found=known, cure="Give one of them with --against")
+    return pipeline
 
 
 def _reach_that_fits(headers: Sequence[LasHeader], xy: NDArray[np.float64], reach: float) -> float:

@@ -54,6 +54,8 @@ class GroundSteps:
     rounds: Sequence[bool]  #: whether the cell is ground after each round that regains ground
     given: float | None  #: mean of the given ground in the cell
     lowest_near: float | None  #: point within 5 cells that may be ground
+    near: int  #: points within 5 m in plan
+    lower: int  #: of them those more than 1 m below the point
     is_given: bool  #: whether heights are those above given ground
     height: float  #: above the ground
     above_provisional: float
@@ -90,7 +92,7 @@ class Verdict:
     classes: Mapping[int, str]  #: names
     probabilities: Mapping[int, float]  #: after priors
     winner: int
-    rival: int  #: the class of the file where the model has it, else the second
+    rival: int  #: the class asked for, that of the file where the model has it, else the second
     passes: Sequence[PassTrace]  #: empty of a network
     stands_for_it_m: float | None  #: how far away the point of its voxel is that is computed
     #: classes that the last pass found likely and the model then excluded: what lies on no line

@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..base.asprs import class_name
+from ..base.asprs import (
+    BRIDGE,
+    LOW_VEGETATION,
+    MEDIUM_VEGETATION,
+    UNCLASSIFIED,
+    class_name,
+)
 from ..base.messages import one_line
 from ..terrain.detached import HELD, SOLID
 from .explanation import Explanation, GroundSteps, PassInput, PassTrace, Verdict
@@ -21,6 +27,19 @@ _OF_FIRST = 10
 _HIGH_M = 2.25
 #: Options of `classify` that run stages after the model.
 _OPTIONS = {"filters.bridges": "--bridges", "filters.polygons": "--polygons"}
+#: Options of `classify` that give points a class that the model did not find.
+_MAKERS = {
+    UNCLASSIFIED: "--keep-sure",
+    LOW_VEGETATION: "--vegetation-heights",
+    MEDIUM_VEGETATION: "--vegetation-heights",
+    BRIDGE: "--bridges",
+}
+#: What to do where the run that made a file differs from that of now.
+_AGAIN = (
+    "\nexplain it with the options of that run: those that give the file's values are the cause"
+)
+#: Share of the points near up to which those far below are few.
+_FEW = 0.1
 #: Width of the column of names.
 _NAME = 16
 #: Width of a number.
@@ -37,18 +56,22 @@ def lines(told: Explanation) -> list[str]:
         f"{_class(told.in_file)} in the file, {_class(told.computed)} computed now",
         *_differences(told),
         "",
-        "WHAT BECAME OF IT",
+        "WHAT BECOMES OF IT, COMPUTED NOW",
         _row("noise", _noise(told)),
         *(
             [_row("ground", "found by another stage")]
             if told.ground is None
-            else _ground(told.ground)
+            else _ground(told.ground, told.noise is None)
         ),
         "",
-        "WHAT THE MODEL SAW",
-        *([_row("nothing", told.kept)] if told.verdict is None else _verdict(told.verdict)),
+        "WHAT THE MODEL SEES",
+        *(
+            [_row("nothing", told.kept)]
+            if told.verdict is None
+            else _verdict(told.verdict, _is_changed(told))
+        ),
         "",
-        "WHAT CAME AFTER",
+        "WHAT COMES AFTER, BY THE OPTIONS GIVEN HERE",
         *_steps(told),
         *(_row("note", note) for note in told.notes),
     ]
@@ -61,7 +84,7 @@ def _steps(told: Explanation) -> list[str]:
         changes = "keeps the class" if code == before else f"makes it {_class(code)}"
         out.append(_row(_OPTIONS.get(name, name), changes))
         before = code
-    return out or [_row("nothing", "no option that changes classes after the model")]
+    return out or [_row("nothing", "none of them changes classes after the model")]
 
 
 def _row(name: str, text: str) -> str:
@@ -85,23 +108,30 @@ def _differences(told: Explanation) -> list[str]:
         out.append("so a person set or confirmed the class (Checked is 1)")
     elif known.get("HeightAboveGround") is False:
         out.append(
-            "so the ground is another: --ground, edited classes 2, 9 or 11, options of the ground "
-            "filter,\nother points around, or another version of the filter"
+            "so the ground of that run was another: --ground, points that someone gave class 2, 9 "
+            "or 11, options\nof the ground filter, other points around, or another version of the "
+            f"filter{_AGAIN}"
         )
     elif known.get("Reliability") is False:
         out.append(
             "so the ground is the same, and the model is another: --model, a version of it, or "
-            "options of its stage"
+            f"options of its stage{_AGAIN}"
         )
-    elif len(known) == 2:
+    elif _is_changed(told):
+        makers = ["--polygons", *filter(None, [_MAKERS.get(told.in_file)])]
         out.append(
-            "so the model said the same, and the class was changed afterwards: by hand, or by an "
-            "option\nthat is not given here (--keep-sure, --vegetation-heights, --bridges, "
-            "--polygons, --where)"
+            "so the model of that run said the same, and the class was changed afterwards: by "
+            f"hand, by {' or '.join(makers)},\nor --where left out a point that had it before"
         )
     elif not told.kept:
         out.append("the file has no HeightAboveGround and Reliability that would tell where")
     return ["", "WHAT DIFFERS", *(f"  {line}" for text in out for line in text.split("\n"))]
+
+
+def _is_changed(told: Explanation) -> bool:
+    """Return whether a class was changed after the model: height and reliability are the same."""
+    same = [is_same for _, _, is_same in told.compared.values()]
+    return told.in_file != told.computed and len(same) == 2 and all(same)
 
 
 def _noise(told: Explanation) -> str:
@@ -121,10 +151,17 @@ def _noise(told: Explanation) -> str:
 # ---- the ground filter ---------------------------------------------------------------------------
 
 
-def _ground(ground: GroundSteps) -> list[str]:
-    """Return what each step of the ground filter made of its cell."""
+def _ground(ground: GroundSteps, no_noise: bool) -> list[str]:
+    """Return what each step of the ground filter made of its cell; `no_noise`: it is left in."""
     name = f"its {ground.cell:g} m cell"
     out = [_row(name, f"lowest point: {_relative(ground.lowest)}")]
+    lower = f"{ground.lower:,} of {ground.near:,} points lie more than 1 m below this point"
+    out.append(_row("within 5 m", lower))
+    few = 0 < ground.lower <= _FEW * ground.near
+    if no_noise and few and not ground.is_ground:
+        out.append(
+            _row("look", "so few are that low: echoes from below the ground? Noise is left in")
+        )
     if ground.is_given:
         given = f"mean of classes 2, 9, 11 there: {_relative(ground.given)}"
         out.append(_row("--ground given", given))
@@ -136,12 +173,14 @@ def _ground(ground: GroundSteps) -> list[str]:
     elif ground.lowest is not None:
         out += _cell_steps(ground, ground.lowest)
     away = f"{abs(ground.above_provisional):.2f} m from the surface through ground cells"
-    judged = f"{ground.tolerance:.2f} m allowed: {'' if ground.is_ground else 'not '}ground"
+    judged = (
+        f"{ground.tolerance:.2f} m allowed on its slope: {'' if ground.is_ground else 'not '}ground"
+    )
     height = f"{ground.height:.2f} m above ground"
     if ground.openings:
         each = (f"{high:.2f} m ({width:g} m window)" for width, high in ground.openings.items())
         height += f"; above what an opening leaves: {', '.join(each)}"
-    return [*out, _row("ground or not", f"{away}, {judged}"), _row("height", height)]
+    return [*out, _row("the point", f"{away}, {judged}"), _row("height", height)]
 
 
 def _relative(height: float | None) -> str:
@@ -154,25 +193,27 @@ def _cell_steps(ground: GroundSteps, lowest: float) -> list[str]:
     """Return what openings, wide roofs and rounds made of a cell, whose lowest point is given."""
     floor = lowest if ground.floor is None else ground.floor
     land = floor if ground.land is None else ground.land
-    width = f"windows of up to {ground.window:g} m"
-    opened = f"{width} do not lower the cell more than a slope would: ground so far"
+    width = f"windows that grow to {ground.window:g} m"
+    opened = f"{width} do not lower the cell more than a slope would: it is ground so far"
     if floor < lowest:
-        opened = f"{width} lower the cell by {lowest - floor:.2f} m: an object"
+        lowered = f"the first that tells lowers the cell by {lowest - floor:.2f} m"
+        opened = f"{width}, {lowered}: it holds an object"
     out = [_row("openings", opened)]
     if land < floor:
-        roof = f"a roof wider than the windows, {floor - land:.2f} m above the land: an object"
+        roof = f"a roof wider than the windows, {floor - land:.2f} m above the land: an object, too"
         out.append(_row("wide roof", roof))
     if land >= lowest:
         return out
     first = next((n for n, ground_now in enumerate(ground.rounds, 1) if ground_now), 0)
-    regained = f"in round {first}: ground, as it continues the ground around"
-    return [*out, _row("regained", regained if first else "no: not among ground, nor near to it")]
+    regained = f"the cell is ground after all, in round {first}: it continues the ground around"
+    no = "no: the cell does not continue the ground around"
+    return [*out, _row("regained", regained if first else no)]
 
 
 # ---- the model -----------------------------------------------------------------------------------
 
 
-def _verdict(verdict: Verdict) -> list[str]:
+def _verdict(verdict: Verdict, is_changed: bool) -> list[str]:
     """Return the probabilities of each pass, and the inputs that decided."""
     codes, passes = list(verdict.classes), verdict.passes
     names = {code: _short(code) for code in codes}
@@ -182,16 +223,21 @@ def _verdict(verdict: Verdict) -> list[str]:
     for name, share in {**shares, "in the end": verdict.probabilities}.items():
         out.append(_row(name, "".join(f"{share.get(code, 0.0):>{_NUMBER}.2f}" for code in codes)))
     if verdict.stands_for_it_m is not None:
-        stands = f"a point {verdict.stands_for_it_m:.2f} m away stands for it: its inputs are shown"
-        out.append(_row("its voxel", stands))
+        away = f"{verdict.stands_for_it_m:.2f} m away"
+        out.append(_row("values", f"those of a point {away}, which stands for all of its voxel"))
     for code in verdict.excluded:
         out.append(_row("no line", f"of such points passes here, so it is no {_class(code)}"))
     if not passes or not passes[0].start:
         return [*out, _row("reasons", "a network, or another learner than a forest, gives none")]
+    if is_changed:
+        return [
+            *out,
+            _row("reasons", "not shown, as the class is not the model's; --json has them"),
+        ]
     pair = verdict.winner, verdict.rival
     ranges = any(each.below for single in passes for each in single.inputs)
     first, second = (class_name(code) for code in pair)
-    about = "and which share of the training's points of either class has lower values."
+    about = "and the share of the training's points of either class that lie lower (50 %: half)."
     if not ranges:
         about = "(The model file has no percentiles of its training to compare it with.)"
     titles = [*map(_short, pair), "value", *(map(_short, pair) if ranges else ())]
@@ -201,7 +247,7 @@ def _verdict(verdict: Verdict) -> list[str]:
         f"  {about}",
         "  " + "".join(f"{title:>{_NUMBER}}" for title in titles),
     ]
-    for number in dict.fromkeys((len(passes), 1)):
+    for number in sorted({1, len(passes)}):
         count = _OF_LAST if number > 1 else _OF_FIRST
         out += _rows(number, passes[number - 1], pair, count, ranges)
     return out
@@ -226,7 +272,7 @@ def _rows(
     chosen += [each for each in ranked if each.name == SURROUNDINGS]
     rest = [sum(e.added.get(c, 0.0) for e in ranked if e not in chosen) for c in pair]
     shares = [f"{single.start.get(code, 0.0):.3f}" for code in pair]
-    out = [_columns(shares, ranges, f"where pass {number} starts")]
+    out = [_columns(shares, ranges, f"where pass {number} starts, knowing nothing")]
     for each in sorted(chosen, key=lambda each: -weight(each)):
         words, _ = words_for(each.name)
         added = [f"{each.added.get(code, 0.0):+.3f}" for code in pair]

@@ -27,7 +27,7 @@ _WORDS = {
     "SurfaceVariationMean": ("mean roughness", ""),
     "SurfaceVariationStd": ("how the roughness varies", ""),
     "HeightAboveGround": ("height above ground", "m"),
-    "Ground": ("the filter calls it ground: 1", ""),
+    "Ground": ("ground by the filter: 1 yes, 0 no", ""),
     "MultipleReturn": ("pulses with several returns", ""),
     "EarlierReturn": ("returns before the last", ""),
     GAP_BELOW: ("empty space below, up to 20", "m"),

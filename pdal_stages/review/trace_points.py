@@ -36,13 +36,22 @@ from .recording import Recording
 
 #: Name of the input that stands for all that is read of an earlier pass.
 SURROUNDINGS = "surroundings"
+#: Radius in meters, in plan, within which points are near ...
+_NEAR_M = 5.0
+#: ... and depth in meters from which on they are lower.
+_LOWER_M = 1.0
 #: Dimensions that are compared with those of the file, and the steps to which `classify` rounds
 #: them.
 _COMPARED = {"HeightAboveGround": 1 / 32, "Reliability": 1 / 64}
 
 
-def trace_point(recording: Recording, place: int, distance_m: float) -> Explanation:
-    """Return how a point came to its class; `place` is its number among those of the recording."""
+def trace_point(
+    recording: Recording, place: int, distance_m: float, against: int | None = None
+) -> Explanation:
+    """Return how a point came to its class; `place` is its number among those of the recording.
+
+    `against` is the class that the one found is compared with, if the model has both.
+    """
     row, at = int(recording.rows[place]), int(recording.rows_seen[place])
     columns = recording.around
     stages = [each.stage for each in recording.stages]
@@ -53,7 +62,7 @@ def trace_point(recording: Recording, place: int, distance_m: float) -> Explanat
     kept = _why_kept(recording, model_stage, at, codes[model_at])
     verdict, steps = None, []
     if not kept:
-        verdict = _verdict(recording, model_stage, place, codes[0])
+        verdict = _verdict(recording, model_stage, place, against or codes[0])
         steps = _own_steps(model_stage, recording, row, verdict, codes[model_at + 1])
     steps += [
         (stage.type, code)
@@ -155,6 +164,8 @@ def _ground(recording: Recording, row: int, stage: HagMorphological | None) -> G
         known = part[np.isfinite(part)]
         return float(known.min()) - z if len(known) else None
 
+    xs, ys, zs = _axes(recording, slice(None))
+    near = np.hypot(xs - x, ys - y) <= _NEAR_M
     heights = {name: float(values[row]) for name, values in recording.heights.items()}
     rounds = [name for name in piece if name.startswith("round_")]
     return GroundSteps(
@@ -165,7 +176,9 @@ def _ground(recording: Recording, row: int, stage: HagMorphological | None) -> G
         made("wide_roofs"),
         [made(name) is not None for name in rounds],
         made("given_ground"),
-        made("low_outliers", round(5 / cell)),
+        made("low_outliers", round(_NEAR_M / cell)),
+        int(np.count_nonzero(near)),
+        int(np.count_nonzero(near & (zs < z - _LOWER_M))),
         stage.given_ground,
         heights["HeightAboveGround"],
         heights[JUDGED[0]],
@@ -178,13 +191,13 @@ def _ground(recording: Recording, row: int, stage: HagMorphological | None) -> G
 # ---- the model -----------------------------------------------------------------------------------
 
 
-def _verdict(recording: Recording, stage: ApplyModel, place: int, in_file: int) -> Verdict:
-    """Return what the model said of a point."""
+def _verdict(recording: Recording, stage: ApplyModel, place: int, against: int) -> Verdict:
+    """Return what the model said of a point; `against` is the rival, if it can be."""
     model, names = stage.model, dict(stage.model.classes)
     row, at = recording.rows[place], recording.rows_seen[place]
     shares = {code: float(recording.seen[f"Probability_{code}"][at]) for code in names}
     order = sorted(names, key=lambda code: -shares[code])
-    rival = in_file if in_file in names and in_file != order[0] else order[1]
+    rival = against if against in names and against != order[0] else order[1]
     by_pass: dict[int, PassTrace] = {}
     stands = None
     for each in recording.inputs:

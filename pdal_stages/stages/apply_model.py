@@ -15,6 +15,7 @@ from ..base.asprs import (
     LOW_VEGETATION,
     MEDIUM_VEGETATION,
     TERRAIN,
+    UNCLASSIFIED,
     by_height,
 )
 from ..base.dimensions import (
@@ -34,7 +35,7 @@ from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.interface import Observe
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
-from ..classifier.prediction import UNCLASSIFIED, PointRoles, Prediction, PredictionOptions
+from ..classifier.prediction import PointRoles, Prediction, PredictionOptions
 from ..terrain.filter_options import FilterOptions
 from .base import Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
