@@ -298,6 +298,7 @@ ROWS: dict[str, dict[str, Row]] = {
     "noise": {
         "as it is": Row(),
         "voxels do not widen in thin clouds": rule(detached, sides=(2.0,)),
+        "voxels do not widen where company is missing": rule(detached, max_lonely=1.0),
         "sparse swarms hold": rule(detached, min_mean=0.0),
         "nearly empty voxels hold": rule(detached, min_mean=0.0, min_around=0),
         "dense clusters stay small": rule(detached, cluster_area_m2=0.0),

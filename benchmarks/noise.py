@@ -4,6 +4,7 @@ python benchmarks/noise.py --data FOLDER
 python benchmarks/noise.py --data FOLDER --classify
 python benchmarks/noise.py --data FOLDER --terrain
 python benchmarks/noise.py --data FOLDER --surveys
+python benchmarks/noise.py --data FOLDER --thinned
 python benchmarks/noise.py --places
 
 Noise as the field knows it is put into each cloud: points and clusters of 2 to 30 within a meter,
@@ -15,8 +16,9 @@ and how far off the ground filter's heights are, with noise marked first and wit
 noise at once (:func:`kinds_of_noise`): how much of each is found, in all and of what is more than
 5 m from every good point, and how many good points are marked, by this stage, by PDAL's
 filters.outlier (statistical, 8 neighbors, multiplier 3) and by counts in voxels of 1 m (lasR's ivf:
-at most 6 points in 27 voxels). With --places, generated land that holds no noise: how much of its
-ground is marked.
+at most 6 points in 27 voxels). With --thinned, how
+many good points of the 29 surveys are marked as flown and thinned. With --places, generated land
+that holds no noise: how much of its ground is marked.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ from clouds import published
 from surveys import SURVEYS
 
 from pdal_stages import detached_noise, filtered_ground
+from pdal_stages.base.hashing import hash_rows
 from pdal_stages.cli import main as command
 
 CLOUDS = (
@@ -60,6 +63,8 @@ CLASSIFIED = (
 #: Labels of points that are what they are called.
 GOOD = (2, 3, 4, 5, 6, 9, 12, 14, 15, 17)
 SHARES = (0.0001, 0.001, 0.01)
+#: Points per m2 that surveys are thinned to.
+THINNED = (4, 1, 0.3, 0.1, 0.04)
 #: Clusters below the ground: points, meters across, meters below; one and five per hectare by
 #: turns.
 CLUSTERS = (
@@ -366,6 +371,28 @@ def surveys(folder: Path) -> None:
         print(f"| {finder} | {means[0]:.4f} % | {worst:.3f} % | {' | '.join(cells)} |")
 
 
+def thinned(folder: Path) -> None:
+    """Print how many good points of the surveys are marked, in percent, as flown and thinned."""
+    print("| survey | as flown | " + " | ".join(f"{d:g} points/m²" for d in THINNED) + " |")
+    print("|---" + "|---:" * (1 + len(THINNED)) + "|")
+    shares = []
+    for name, known in SURVEYS.items():
+        xyz, codes, _ = published(folder, known)
+        xyz = xyz[~np.isin(codes, known.dropped)]
+        density = len(xyz) / (25 * len(np.unique(np.floor(xyz[:, :2] / 5), axis=0)))
+        order = hash_rows(xyz.T, 0)
+        row = [
+            100 * (detached_noise(xyz[order < np.uint64(least)]) > 0).mean() if part < 1 else np.nan
+            for part, least in ((d / density, min(d / density, 0.999) * 2.0**64) for d in THINNED)
+        ]
+        shares.append([100 * (detached_noise(xyz) > 0).mean(), *row])
+        print(
+            f"| {name} | " + " | ".join(f"{share:.4f}" for share in shares[-1]) + " |", flush=True
+        )
+    for word, value in (("mean", np.nanmean), ("worst", np.nanmax)):
+        print(f"| {word} | " + " | ".join(f"{v:.4f}" for v in value(shares, axis=0)) + " |")
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -373,11 +400,15 @@ def main() -> None:
     parser.add_argument("--classify", action="store_true")
     parser.add_argument("--terrain", action="store_true")
     parser.add_argument("--surveys", action="store_true")
+    parser.add_argument("--thinned", action="store_true")
     parser.add_argument("--places", action="store_true")
     options = parser.parse_args()
     folder = options.data
     if options.places:
         places()
+        return
+    if options.thinned:
+        thinned(folder)
         return
     if options.surveys:
         surveys(folder)

@@ -16,7 +16,7 @@ class DetachedNoise(ClassStage):
 
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
-    algorithm_version = 3
+    algorithm_version = 4
     counts = {"low": "marked as low noise", "high": "marked as high noise"}
     reads_around = frozenset()  # classes alone, by `ignore`
     cluster: int = option(

@@ -1,10 +1,12 @@
 """Points that nothing holds: alone, in thin veils or in small clusters apart from everything.
 
 Space is cut into voxels that are the wider the thinner the cloud is around, so that the surfaces
-and crowns of a survey fill voxels that touch. A voxel is solid if it belongs to a component of
-voxels that touch, none of them nearly empty, and that is large or long and thin as a wire. All else
-is detached: held if something solid is close, loose if not. All is counted on absolute grids, so
-that the order of points, tiles and threads do not matter.
+and crowns of a survey fill voxels that touch. They are widened where more than one point in ten has
+little company; where that is so in the widest, as in thin clouds of steep forests, gaps tell
+nothing, and nothing is detached. A voxel is solid if it belongs to a component of voxels that
+touch, none of them nearly empty, and that is large or long and thin as a wire. All else is
+detached: held if something solid is close, loose if not. All is counted on absolute grids, so that
+the order of points, tiles and threads do not matter.
 """
 
 from __future__ import annotations
@@ -50,6 +52,9 @@ class DetachedRules(NamedTuple):
     #: gap times the cube root of `dense_per_m2` / density, for points fill volumes
     sides: tuple[float, ...] = (1.0, 1.2, 1.5, 2.0, 2.4, 3.0, 4.0, 6.0)
     dense_per_m2: float = 10.0  #: density at which voxels are as wide as the gap
+    #: points in a voxel and the 26 around it: fewer, or those of a swarm, lack company
+    min_company: int = 24
+    max_lonely: float = 0.1  #: where a larger share of the points lacks it voxels are widened
     flat_m: float = 1.5  #: voxels are not higher than this, or than half their side
     min_around: int = 4  #: points in a voxel and the 26 around it: with fewer it is nearly empty
     min_mean: float = 2.0  #: so it is with fewer per voxel that holds points, as in a swarm ...
@@ -100,6 +105,16 @@ class Voxels(NamedTuple):
         height = min(side, max(RULES.flat_m, side / 2))
         return cls(side, height, left, bottom, points.shape[1] * per_block + 2 * rim)
 
+    def sum_in_blocks(self, keys: NDArray, values: NDArray, shape: tuple[int, int]) -> NDArray:
+        """Return the sums of values (n,) of voxels in blocks, `shape`."""
+        per_block = round(BLOCK_M / self.side)
+        row, column = (
+            (place - RULES.hold_columns) // per_block
+            for place in np.divmod(keys >> BITS, self.width)
+        )
+        number = row * shape[1] + column
+        return np.bincount(number, values, shape[0] * shape[1]).astype(np.int64).reshape(shape)
+
 
 def find_detached(
     x: NDArray, y: NDArray, z: NDArray, cluster: int, gap: float, threads: int | None = None
@@ -128,13 +143,23 @@ def find_detached(
     scale = np.where(count > 0, np.minimum(scale, len(RULES.sides) - 1), -1)
     most = np.maximum(cluster, RULES.cluster_area_m2 * density)
     state = np.zeros(len(x), np.uint8)
-    for number in np.unique(scale[scale >= 0]):
-        side = RULES.sides[number]
+    for number, side in enumerate(RULES.sides):
+        if not (scale == number).any():
+            continue
         far = max(RULES.extent_sides * side, RULES.extent_m) + (RULES.hold_columns + 2) * side
         near = _dilate(scale == number, math.ceil(far / BLOCK_M)).ravel()
         frame = Voxels.over(points, side)
         keys, counts = _count(points, near, frame, threads)
-        found = _judge(keys, counts, most, frame, threads)
+        company, voxels = _count_around(keys, counts, frame.width, threads)
+        sparse = RULES.min_mean * voxels
+        lonely = np.where(company < np.maximum(RULES.min_company, sparse), counts, 0)
+        lonely = sum_around(frame.sum_in_blocks(keys, lonely, shape))
+        # Blocks whose voxels are too narrow are judged by the next wider ones, if there are any.
+        scale[(scale == number) & (lonely > RULES.max_lonely * sum_around(count))] += 1
+        if not (scale == number).any():
+            continue
+        least = np.where(voxels <= RULES.max_line_voxels, RULES.min_around, sparse)
+        found = _judge(keys, counts, company >= least, most, frame, threads)
         detached = np.zeros((keys[-1] >> BITS) + 1, np.bool_)
         detached[keys[found > SOLID] >> BITS] = True
         known = frame, (scale == number).ravel(), detached, keys, found
@@ -236,28 +261,41 @@ def _assign(points, state, frame, wanted, detached, keys, found):
                 state[k] = found[np.searchsorted(keys, key)]
 
 
-def _judge(keys, counts, most, frame: Voxels, threads: int | None) -> NDArray[np.uint8]:
-    """Return the states (n,) of voxels; `most` (h, w) are points of a cluster in each block."""
-    number = len(keys)
+def _spans(number: int) -> list[tuple[int, int]]:
+    """Return where shares of some voxels begin and end."""
     bounds = np.linspace(0, number, number // SHARE + 2).astype(np.int64)
-    spans = list(itertools.pairwise(bounds.tolist()))
-    around, parent = np.empty(number, np.bool_), np.arange(number)
+    return list(itertools.pairwise(bounds.tolist()))
 
-    def sum_points(span):
-        _fill(keys, counts, frame.width, *span, RULES, around)
+
+def _count_around(
+    keys: NDArray[np.int64], counts: NDArray[np.int64], width: int, threads: int | None
+) -> NDArray[np.int64]:
+    """Return the points and the voxels (2, n) in each voxel and the 26 around it."""
+    sums = np.zeros((2, len(keys)), np.int64)
+
+    def count(span):
+        _sum_27(keys, counts, width, *span, sums)
+
+    for _ in map_blocks(count, _spans(len(keys)), threads):
+        pass
+    return sums
+
+
+def _judge(keys, counts, full, most, frame: Voxels, threads: int | None) -> NDArray[np.uint8]:
+    """Return the states (n,) of voxels; `most` (h, w) are points of a cluster in each block."""
+    spans, parent = _spans(len(keys)), np.arange(len(keys))
 
     def join(span):
-        _join(keys, around, frame.width, *span, span[1], parent)
+        _join(keys, full, frame.width, *span, span[1], parent)
 
-    for work in (sum_points, join):
-        for _ in map_blocks(work, spans, threads):
-            pass
+    for _ in map_blocks(join, spans, threads):
+        pass
     last_row = (frame.width + 2) << BITS
     for _, end in spans[:-1]:  # what touches across the end of a span
         begin = np.searchsorted(keys, keys[end] - last_row)
-        _join(keys, around, frame.width, begin, end, number, parent)
-    alone = np.empty(number, np.uint8)
-    _judge_components(keys, counts, around, parent, most, frame, RULES, alone)
+        _join(keys, full, frame.width, begin, end, len(keys), parent)
+    alone = np.empty(len(keys), np.uint8)
+    _judge_components(keys, counts, full, parent, most, frame, RULES, alone)
     state = alone.copy()
 
     def hold(span):
@@ -269,9 +307,8 @@ def _judge(keys, counts, most, frame: Voxels, threads: int | None) -> NDArray[np
 
 
 @njit
-def _fill(keys, counts, width, begin, end, rules, full):
-    """Find the voxels of a span with enough points in them and in the 26 around."""
-    total, voxels = np.zeros((2, end - begin), np.int64)
+def _sum_27(keys, counts, width, begin, end, sums):
+    """Sum the points and the voxels in the voxels of a span and in the 26 around each."""
     for j in range(-1, 2):
         for i in range(-1, 2):
             offset = (j * width + i) << BITS
@@ -282,13 +319,9 @@ def _fill(keys, counts, width, begin, end, rules, full):
                     start += 1
                 other = start
                 while other < len(keys) and keys[other] <= at + 1:
-                    total[k - begin] += counts[other]
-                    voxels[k - begin] += 1
+                    sums[0, k] += counts[other]
+                    sums[1, k] += 1
                     other += 1
-    for k in range(begin, end):
-        few = voxels[k - begin] <= rules.max_line_voxels
-        least = rules.min_around if few else rules.min_mean * voxels[k - begin]
-        full[k] = total[k - begin] >= least
 
 
 @njit
