@@ -4,7 +4,7 @@ Squared distances are those of float64 differences, so the answer is a function 
 set: neither the order of the points, nor the tile, nor which queries are searched together changes
 it. Points with equal coordinates are interchangeable.
 
-Eight queries that lie together share the candidates within a reach, guessed from the queries
+Four queries that lie together share the candidates within a reach, guessed from the queries
 before; each sorts those within its own. In the plane the squared distance is uniformly
 distributed, so a counting sort by it fills its bins evenly.
 
@@ -248,7 +248,7 @@ def gather(tree, box, reach2, most_equal, limit, candidates):
 
 #: Queries that share one set of candidates: enough to share the traversal of the tree, few enough
 #: that most candidates are near to each of them.
-GROUP = 8
+GROUP = 4
 
 #: Bins of squared distance; behind them what lies beyond the reach. Enough that a bin holds a few
 #: of 50 to 100 neighbors, few enough that the counts stay in the fastest cache.
