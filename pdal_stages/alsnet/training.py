@@ -17,6 +17,7 @@ from ..base.progress import Progress
 from ..base.threads import map_blocks, resolve_threads
 from ..classifier.class_map import ClassMap
 from ..classifier.model import Model, load_model
+from ..classifier.model_info import SampleCounts
 from ..classifier.sampling import figures
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
@@ -73,7 +74,7 @@ def train(clouds: Sequence[TrainingCloud], options: TrainingOptions, progress: b
         torch.set_num_threads(threads)
     codes, names = labeled.classes.codes, labeled.classes.names
     count = np.bincount(position[position >= 0], minlength=len(codes)).tolist()
-    counts = ({"available": points, "samples": points, "duplicates": 0} for points in count)
+    counts = [SampleCounts(available=n, samples=n, duplicates=0) for n in count]
     size = {"count": sum(count), "seed": options.seed, "samples": sum(count)}
     info = labeled.describe(
         options, counts, {**size, **training.describe()}, [None], ("numpy", "torch")

@@ -18,6 +18,7 @@ from ..base.checks import strict_json
 from ..base.errors import ModelError, OptionError
 from ..base.json_types import JsonObject
 from ..base.messages import one_line
+from .model_info import ModelInfo
 
 #: Bins of reliability from 0 to 1; the last one holds 1. Model files hold so many counts, so
 #: another number needs another version of their format (not tuned).
@@ -157,7 +158,7 @@ class Calibration:
         return out
 
 
-def read_calibration(info: JsonObject, path: str) -> Calibration:
+def read_calibration(info: ModelInfo, path: str) -> Calibration:
     """Return a model's calibration from its manifest `info`, or from the file beside its `path`.
 
     Raises
@@ -184,7 +185,7 @@ def read_calibration(info: JsonObject, path: str) -> Calibration:
     )
 
 
-def calibrate_on_base(refined: JsonObject, base: JsonObject, path: str) -> JsonObject:
+def calibrate_on_base(refined: JsonObject, base: ModelInfo, path: str) -> JsonObject:
     """Return the calibration of a model whose labels are a person's corrections of its base.
 
     Corrections lie where the base was worst. So the counts of the `refined` model are taken for new

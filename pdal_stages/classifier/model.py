@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,7 @@ from .interface import (
     classifier_of,
     preprocessing,
 )
+from .model_info import ModelInfo
 from .prediction import (
     PointRoles,
     Prediction,
@@ -63,7 +64,7 @@ class Model:
     passes: tuple[Estimator, ...]
     classes: list[tuple[int, str]]  #: code and name, in the order of the columns of probabilities
     #: the rest of the manifest: how it was trained, scores, by pass its importances
-    info: JsonObject = field(default_factory=dict)
+    info: ModelInfo
 
     @property
     def algorithm(self) -> Estimator:
@@ -437,4 +438,4 @@ def assemble(manifest: JsonObject, arrays: model_file.Arrays) -> Model:
     info["passes"] = [
         {key: entry[key] for key in scores if key in entry} for entry in manifest["passes"]
     ]
-    return Model(tuple(passes), classes, info)
+    return Model(tuple(passes), classes, cast(ModelInfo, info))

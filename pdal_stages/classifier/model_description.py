@@ -8,6 +8,7 @@ from typing import Any, Protocol
 from ..base.json_types import JsonObject, StageJson
 from ..base.messages import one_line
 from .calibration import Calibration
+from .model_info import DensityRange, ModelInfo
 
 #: Most surveys that the text names, and most inputs by importance.
 _SURVEYS = 40
@@ -21,7 +22,7 @@ class DescribedModel(Protocol):
     """The part of a ``Model`` that the text reads."""
 
     @property
-    def info(self) -> JsonObject:
+    def info(self) -> ModelInfo:
         """The manifest without its passes."""
 
     @property
@@ -64,7 +65,7 @@ def text(model: DescribedModel) -> str:
     return "\n".join(map(one_line, [*lines, *_classes(info), ""]))
 
 
-def _measured(info: JsonObject) -> _Rows:
+def _measured(info: ModelInfo) -> _Rows:
     """Return the share of right points on ground that was held out, by the class given."""
     if not info.get("sureness"):
         return []
@@ -135,7 +136,7 @@ def _training(model: DescribedModel) -> _Rows:
     ]
 
 
-def _classes(info: JsonObject) -> list[str]:
+def _classes(info: ModelInfo) -> list[str]:
     """Return the table of classes."""
     lines = [f"{'class':<34}{'available':>12}{'samples':>10}{'duplicates':>12}{'F1 held out':>13}"]
     f1 = held_out(info).get("f1") or {}
@@ -148,19 +149,20 @@ def _classes(info: JsonObject) -> list[str]:
     return lines
 
 
-def range_text(densities: Mapping[str, float]) -> str:
+def range_text(densities: DensityRange) -> str:
     """Return ``0.3 to 46``, or one number where both are alike."""
-    return " to ".join(dict.fromkeys(f"{densities[end]:.3g}" for end in ("low", "high")))
+    ends = densities["low"], densities["high"]
+    return " to ".join(dict.fromkeys(f"{end:.3g}" for end in ends))
 
 
-def held_out(info: JsonObject) -> JsonObject:
+def held_out(info: ModelInfo) -> JsonObject:
     """Return the scores on held-out ground, of a forest by cross-validation; empty without any."""
     of_network = info["training"].get("held_out")
     crossed = info["accuracy"]["cross_validation"]
     return of_network if isinstance(of_network, dict) else crossed["chosen"] if crossed else {}
 
 
-def score(info: JsonObject) -> str:
+def score(info: ModelInfo) -> str:
     """Return the score in a line, or why there is none."""
     row = held_out(info)
     if not row and info.get("sureness"):

@@ -28,6 +28,7 @@ from ..base.grid import places_among
 from ..base.hashing import hash_rows
 from ..base.json_types import JsonObject
 from ..base.progress import Progress
+from .model_info import SampleCounts
 
 #: Side of a cell of the curve in meters (not tuned).
 CELL = 0.5
@@ -78,7 +79,7 @@ class Samples:
         out[np.concatenate(places)] = values
         return out
 
-    def counts(self, position: int) -> dict[str, int]:
+    def counts(self, position: int) -> SampleCounts:
         """Return the points available, different points drawn, and duplicates of one class."""
         weight = self.weight[self.label == position]
         return {

@@ -27,6 +27,7 @@ from .input_dimensions import OPTIONAL_DIMENSIONS
 from .interface import PredictRequest, weigh
 from .learner import Learner
 from .model import Model
+from .model_info import ClassInfo, ModelInfo, PassScores, Priors, SampleCounts
 from .sampling import BLOCK_M, Folds, Samples, draw_samples, figures, split
 from .training_clouds import TrainingCloud, label_classes
 from .training_options import LEAST_PER_TREE, PER_TREE, TrainingOptions, feature_plan
@@ -198,7 +199,7 @@ class ForestTraining:
         o, base = self.options, self.base
         validation, notes = self._validate()
         forests, importances = self._passes()
-        priors = (
+        priors: Priors | None = (
             None
             if self.factors is None
             else {"weight": o.prior_weight, "factors": self.factors.tolist()}
@@ -419,8 +420,8 @@ def _join_columns(
 
 
 def describe_refinement(
-    base: Any, info: JsonObject, names: Mapping[int, str], codes: Sequence[int]
-) -> JsonObject:
+    base: Model, info: ModelInfo, names: Mapping[int, str], codes: Sequence[int]
+) -> ModelInfo:
     """Return the manifest's entries for a model that is a base's passes and a forest on top.
 
     Parameters
@@ -433,15 +434,13 @@ def describe_refinement(
     codes : sequence of int
         Classes of the last pass.
     """
-    counts = {"available": 0, "samples": 0, "duplicates": 0}
-    inherited = {entry["code"]: {"labels": entry["labels"]} for entry in base.info["classes"]}
-    trained = {entry["code"]: entry for entry in info["classes"]}
-    classes = [
-        {**counts, **inherited.get(code, {}), **trained.get(code, {})}
-        | {"code": code, "name": names[code]}
-        for code in codes
+    none = SampleCounts(available=0, samples=0, duplicates=0)
+    known: dict[int, ClassInfo] = {each["code"]: {**each, **none} for each in base.info["classes"]}
+    known |= {each["code"]: each for each in info["classes"]}
+    classes: list[ClassInfo] = [
+        {**known[code], "code": code, "name": names[code]} for code in codes
     ]
-    scores = [
+    scores: list[PassScores] = [
         {**entry, "codes": own_codes}
         for own_codes, entry in zip(base.codes_of, base.info["passes"], strict=True)
     ]

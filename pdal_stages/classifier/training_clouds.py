@@ -25,6 +25,7 @@ from ..features.point_grid import check_xyz
 from ..features.voxels import represent
 from .class_map import BACKGROUND, MAX_LABEL, ClassMap
 from .input_dimensions import list_values
+from .model_info import ModelInfo, Priors, SampleCounts
 from .training_options import TrainingOptions
 
 #: A thinned copy is made where it would have less than this share of the points: one of nearly all
@@ -186,13 +187,13 @@ class Labeled:
     def describe(
         self,
         options: TrainingOptions,
-        counts: Iterable[Mapping[str, int]],
+        counts: Iterable[SampleCounts],
         training: JsonObject,
         importances: Iterable[Sequence[float] | None],
         packages: Iterable[str],
         crossed: JsonObject | None = None,
-        **more: Any,
-    ) -> JsonObject:
+        priors: Priors | None = None,
+    ) -> ModelInfo:
         """Return the manifest of a model trained on the clouds.
 
         `counts` are those of each class's samples, `importances` those of each pass, `crossed` is
@@ -218,12 +219,14 @@ class Labeled:
                 ],
                 **training,
             },
-            **more,
+            "priors": priors,
             **({"lines": sorted(options.lines)} if options.lines else {}),
             "densities": {"low": min(positive, default=0.0), "high": max(positive, default=0.0)},
             "voxel": options.voxel,
             "accuracy": {"cross_validation": crossed},
-            "passes": [{"importances": values} for values in importances],
+            "passes": [
+                {"importances": None if each is None else list(each)} for each in importances
+            ],
             "created_by": {
                 "pdal_stages": __version__,
                 "python": platform.python_version(),

@@ -22,6 +22,7 @@ from ..base.json_types import JsonObject, StageJson
 from ..base.messages import Report, plain
 from ..base.units import name_of_wkt
 from ..classifier.model import loaded_model
+from ..classifier.model_info import ClassInfo
 from .apply_model import ApplyModel
 from .base import Stage, StageContext, files_read
 from .options import Selection, option
@@ -268,7 +269,7 @@ class AccuracyStage(Stage):
         )
 
 
-def _one_code_system(trained: Sequence[StageJson]) -> bool:
+def _one_code_system(trained: Sequence[ClassInfo]) -> bool:
     """Return whether labels and codes of a model mean the same.
 
     For instance they differ where label 5 became code 6, and label 8 code 5.

@@ -252,7 +252,7 @@ class TrainModel(Stage, settings=TrainingOptions):
 
     def _report(self, model: Model, report: Report) -> None:
         """Report the scores of a model, and samples that it cannot learn from."""
-        shown = {key: model.info[key] for key in _SHOWN if key in model.info}
+        shown = {key: value for key, value in model.info.items() if key in _SHOWN}
         report.figures |= {"model": self.filename, **shown}
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
             report.warnings.append(
