@@ -167,8 +167,8 @@ class _CodeCache:
     def roots() -> list[Path]:
         """Return the folders that code may be in: the first that can be written is used."""
         named = os.environ.get("NUMBA_CACHE_DIR")
-        own = os.path.expanduser("~/.cache/pdal-stages")
-        folders = [named] if named else [str(_PACKAGE / "__pycache__"), own]
+        ours = os.path.expanduser("~/.cache/pdal-stages")
+        folders = [named] if named else [str(_PACKAGE / "__pycache__"), ours]
         return [Path(os.path.realpath(folder)) / "kernels" for folder in folders]
 
     def folder_of(self, kernel: Kernel) -> Path | None:

@@ -291,10 +291,10 @@ class _StepOnBand:
             return read
         classifier, _, factors = self.weighted_pass
         assert isinstance(classifier, FeatureReader)
-        own = classifier.probabilities(read, rows)
+        probabilities = classifier.probabilities(read, rows)
         if self.observe is not None:
-            self.observe(rows, read, own)
-        p = weigh(own, factors)
+            self.observe(rows, read, probabilities)
+        p = weigh(probabilities, factors)
         return count_shares(p) if self.hands_on else p
 
 

@@ -156,9 +156,9 @@ class Context:
             side, axes, votes = self.scales[token]
             return CellMeans(*cell_means(xyz[:, :axes], shares, side, votes))
 
-        around = [token for token in self.tokens if token != OWN]
-        parts = map_blocks(compute, around, threads)
-        return CellContext(self.tokens, shares, dict(zip(around, parts, strict=True)))
+        tokens = [token for token in self.tokens if token != OWN]
+        parts = map_blocks(compute, tokens, threads)
+        return CellContext(self.tokens, shares, dict(zip(tokens, parts, strict=True)))
 
     def check_codes(self, codes: Sequence[int], dimensions: Sequence[str]) -> None:
         """Raise a ModelError where segments or lines need what is not there.
@@ -209,13 +209,13 @@ class CellContext:
 
     tokens: tuple[str, ...]
     shares: npt.NDArray[np.uint16]  #: (n, classes) of the points themselves
-    #: of the tokens that look around
-    around: Mapping[str, CellMeans | SegmentContext | LineContext]
+    #: of the tokens that look farther than the point
+    surroundings: Mapping[str, CellMeans | SegmentContext | LineContext]
 
     def columns(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """Return the columns (b, columns) of some of the points, token by token."""
         parts = [
-            self.shares[rows] / WHOLE if token == OWN else self.around[token].columns(rows)
+            self.shares[rows] / WHOLE if token == OWN else self.surroundings[token].columns(rows)
             for token in self.tokens
         ]
         return np.concatenate(parts, axis=1, dtype=np.float32)

@@ -129,9 +129,9 @@ class CloudFeatures:
         """
         request, names = self._request, self.features.plan.dimensions
         near = self._slice_around(rows)
-        given = {name: np.asarray(values)[near] for name, values in request.dimensions.items()}
+        columns = {name: np.asarray(values)[near] for name, values in request.dimensions.items()}
         xyz = request.xyz[near]
-        known = add_surroundings(names, xyz, given, request.threads)
+        known = add_surroundings(names, xyz, columns, request.threads)
 
         def take(some: npt.NDArray[np.int64]) -> dict[str, npt.NDArray]:
             return take_dimensions(names, known, len(xyz), some - near.start)

@@ -50,7 +50,7 @@ class InputPlan:
 
 
 class PassInputs(NamedTuple):
-    """What a pass read of some points, and the probabilities that it gave them."""
+    """The inputs of some points that a pass read, and the probabilities that it gave them."""
 
     number: int  #: of the pass, from 0
     rows: npt.NDArray[np.int64]  #: (b,) rows in the cloud

@@ -12,7 +12,7 @@ from .training_percentiles import PercentileTable
 
 
 class PassScores(TypedDict, total=False):
-    """What the file has of a classifier beside what the classifier itself needs."""
+    """Entries on a classifier that it does not need itself to classify."""
 
     importances: list[float] | None  #: of its inputs; None of a network
     percentiles: PercentileTable
@@ -21,7 +21,7 @@ class PassScores(TypedDict, total=False):
 
 
 class Priors(TypedDict):
-    """How the classes' probabilities are weighted (``prior_weight``)."""
+    """Factors of the classes' probabilities (``prior_weight``)."""
 
     weight: float
     factors: list[float]

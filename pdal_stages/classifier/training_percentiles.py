@@ -42,6 +42,6 @@ def percentiles_by_class(
         if not len(rows):
             continue
         for column, name in enumerate(names):
-            found = np.percentile(values[rows, column], PERCENTILES, method="nearest")
-            table[name][str(code)] = [float(f"{value:.4g}") for value in found]
+            row = np.percentile(values[rows, column], PERCENTILES, method="nearest")
+            table[name][str(code)] = [float(f"{value:.4g}") for value in row]
     return table if len(json.dumps(table)) < LIMIT_BYTES else None

@@ -47,8 +47,8 @@ def classify_file(
             _refuse_lost_dimensions(layout, request)
         if listed := extra_dims_option(layout, request.extra_dims):
             pipeline.set_default(-1, extra_dims=listed)
-    own = layout.extra_by_name if layout else ()
-    pipeline.select(request.where, {*request.creates} - {*own})
+    extra = layout.extra_by_name if layout else ()
+    pipeline.select(request.where, {*request.creates} - {*extra})
     count = pipeline.execute(arrays=False)
     return count, [*_log_of(pipeline), *pipeline.messages]
 

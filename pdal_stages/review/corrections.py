@@ -129,7 +129,7 @@ def _pairs(before: str, after: str, output: str) -> list[_Pair]:
         output = os.path.join(output, "#")
     outputs = outputs_of(files, output)
     try:
-        partners = {one: other for other, one in paired(edited, files)} if edited else {}
+        partners = {path: other for other, path in paired(edited, files)} if edited else {}
     except StageError as error:
         what = "each corrected file needs one before editing, of which its name tells"
         raise StageError(what, found=error.found, cure=error.cure) from None

@@ -171,9 +171,9 @@ def _heights(
     for rows, core, part, raster in pieces if count else ():
         dimensions, nowhere = _measure(part, raster, options)
         counts["without_terrain"] += int(np.count_nonzero(nowhere[core]))
-        own = rows if isinstance(rows, slice) else rows[core]
+        places = rows if isinstance(rows, slice) else rows[core]
         for name, values in dimensions.items():
-            out[name][own] = values[core]
+            out[name][places] = values[core]
     return out
 
 
@@ -199,12 +199,12 @@ def _filtered_pieces(points: GroundPoints, options: FilterOptions) -> Iterator[_
     largest = int(min(MAX_CELLS_PER_POINT * len(points.x), MAX_CELLS))
     for rows, core in patches(points.column, points.row, reach_of_points(options), gap, largest):
         part, wanted = points.take(rows), None
-        own = _window_of(part, core)
+        home = _window_of(part, core)
         window = _window_of(part).padded(FILL_RINGS + 1)
-        near, keep = part, _cut_to(own, options.keep)
+        near, keep = part, _cut_to(home, options.keep)
         # Points farther away only tell which cells are ground.
         if not isinstance(rows, slice) and not isinstance(core, slice):
-            wanted = own.padded(reach_of_cells(options, cells.last))
+            wanted = home.padded(reach_of_cells(options, cells.last))
             seen = wanted.contains(part.column, part.row)
             rows, core, near = rows[seen], core[seen], part.take(seen)
         # The raster in between has no name: it takes as much memory as all else.

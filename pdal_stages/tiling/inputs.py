@@ -309,11 +309,11 @@ class Survey:
         squares = squares[np.lexsort(squares.T[:2])]  # as keys ascend
         key, points = cell_keys(squares[:, 0], squares[:, 1]), squares[:, 2]
         few = np.flatnonzero(points < _COMPANY)
-        around = np.zeros(len(few), np.int64)
+        company = np.zeros(len(few), np.int64)
         for columns, rows in product((-1, 0, 1), repeat=2) if len(few) else ():
             place, there = places_among(key, key[few] + key_offset(columns, rows))
-            around += np.where(there, points[place], 0)
-        lone = key[few[around < _COMPANY]]
+            company += np.where(there, points[place], 0)
+        lone = key[few[company < _COMPANY]]
         if not len(lone) or len(lone) == len(key):
             return LonePoints(self.lone_grid, lone[:0], self.bounds)
         column, row, _ = squares[~np.isin(key, lone)].T

@@ -16,7 +16,7 @@ _FAR_M = 96.0
 
 
 class RoundStage(NamedTuple):
-    """How far around a tile a stage of a round matters, in meters.
+    """A stage of a round, and how far around a tile it matters, in meters.
 
     A stage that looks 10 m far, after one that looks 5 m far, of which a later stage reads the
     results within 3 m of the tile, has `used_m` 3 and `before_m` 5: it is right there if points

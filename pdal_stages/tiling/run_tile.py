@@ -472,9 +472,9 @@ def _describe(halo: _TileHalo, pieces: list[Piece], result: RoundResult) -> Tile
 
 def _shared(pieces: Sequence[Piece]) -> list[tuple[str, str, int]]:
     """Return the pairs of inputs that hold the same points in a tile, and how many."""
-    own = [(piece, piece.records[piece.own_rows]) for piece in pieces if len(piece.own_rows)]
-    columns = [RecordColumns([(piece.layout, records)]) for piece, records in own]
-    paths = [piece.source.path for piece, _ in own]
+    parts = [(piece, piece.records[piece.own_rows]) for piece in pieces if len(piece.own_rows)]
+    columns = [RecordColumns([(piece.layout, records)]) for piece, records in parts]
+    paths = [piece.source.path for piece, _ in parts]
     return [(paths[a], paths[b], count) for (a, b), count in count_shared(columns).items()]
 
 

@@ -113,11 +113,11 @@ class RecordRun(SurveyRun):
         wide = range(-math.ceil(reach / grid.size), math.ceil(reach / grid.size) + 1)
         near: dict[Tile, list[Job]] = {}
         for i, j in tiles:
-            around = [
+            sources = [
                 of_tile[i + k, j + l] for l in wide for k in wide if (i + k, j + l) in of_tile
             ]
-            near |= {(i, j): around} if around else {}
-        marks = {tile: [job.digest for job in around] for tile, around in near.items()}
+            near |= {(i, j): sources} if sources else {}
+        marks = {tile: [job.digest for job in sources] for tile, sources in near.items()}
         points = {tile: of_tile[tile].points if tile in of_tile else 1 for tile in near}
         jobs = self._jobs(name, points, marks)
 
