@@ -9,6 +9,8 @@
     # a generated wood at 1.7 points/m2 side by side, or a real tile; 1, 2 and all threads
     python benchmarks/whole_job.py --sparse --sizes 0.25 1 4 --threads 1 2 0 --model standard
     python benchmarks/whole_job.py --sparse DATA/bridge/ign_0299_6802.laz --sizes 4 --model standard
+    # beside OpenPointClass (built with -DWITH_PDAL=OFF -DWITH_GBT=OFF), by turns
+    python benchmarks/whole_job.py --openpointclass BUILD
     # CPU and wall seconds and memory of each part of one job
     python benchmarks/whole_job.py --parts --sparse --sizes 4 --model standard
     python benchmarks/whole_job.py --json FILE
@@ -16,7 +18,8 @@
 Trains a model with all defaults on one generated town (kept in --folder), classifies another with
 `pdal-stages classify`, and tells least / median / largest of --repeats runs. The command runs as a
 process of its own, so start, import, reading and writing LAZ are in its times; memory is the
-largest that the process ever held.
+largest that the process ever held. OpenPointClass is trained on the same town with its defaults,
+reads and writes binary PLY, and does not smooth.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -123,14 +127,15 @@ def trained(folder: Path) -> Path:
     return path
 
 
-def once(cloud: Path, model: str, out: Path, threads: int) -> dict[str, float]:
-    """Wall and CPU seconds of one run, and the most memory of it in MiB."""
+def once(command: list[str], threads: int) -> dict[str, float]:
+    """Wall and CPU seconds of one run of a command, and the most memory of it in MiB."""
+    counts = {"LOKY_MAX_CPU_COUNT": str(threads), "OMP_NUM_THREADS": str(threads)}
     began = time.perf_counter()
     process = subprocess.Popen(
-        command("classify", cloud, out, "--model", model),
+        command,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        env={**os.environ, **({"LOKY_MAX_CPU_COUNT": str(threads)} if threads else {})},
+        env={**os.environ, **(counts if threads else {})},
     )
     assert process.stderr is not None
     errors = process.stderr.read()
@@ -141,32 +146,80 @@ def once(cloud: Path, model: str, out: Path, threads: int) -> dict[str, float]:
     return {"wall": wall, "cpu": usage.ru_utime + usage.ru_stime, "memory": usage.ru_maxrss / 1024}
 
 
-def measured(cloud: Path, model: str, repeats: int, threads: int) -> dict[str, Any]:
-    """Some runs over a cloud with some threads; 0: all."""
+def write_ply(cloud: Path) -> Path:
+    """Write a cloud as the PLY that OpenPointClass reads, beside it, once."""
+    path = cloud.with_suffix(".ply")
+    if path.exists():
+        return path
+    las = laspy.read(cloud)
+    points = np.empty(
+        len(las.points), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("classification", "u1")]
+    )
+    for axis in "xyz":
+        points[axis] = las[axis] - np.floor(np.min(las[axis]))
+    points["classification"] = las.classification
+    names = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{names}"
+    head += "property uchar classification\nend_header\n"
+    path.write_bytes(head.encode() + points.tobytes())
+    return path
+
+
+def openpointclass(folder: Path, programs: Path, cloud: Path, out: Path) -> list[str]:
+    """Train OpenPointClass once as our model is, and return the command that classifies a cloud."""
+    model = folder / "openpointclass.bin"
+    if not model.exists():
+        ply = write_ply(town(folder, 0.5, 7.0, 1))
+        train = [programs / "pctrain", ply, "--output", model]
+        subprocess.run(list(map(str, train)), check=True, capture_output=True)
+    words = [programs / "pcclassify", write_ply(cloud), out, model, "--regularization", "none"]
+    return list(map(str, words))
+
+
+def measured(
+    cloud: Path,
+    model: str,
+    repeats: int,
+    threads: int,
+    peer: Callable[[Path, Path], list[str]] | None,
+) -> list[dict[str, Any]]:
+    """Some runs over a cloud with some threads, by turns with a peer; 0: all threads."""
     with laspy.open(cloud) as reader:
         points = reader.header.point_count
     with tempfile.TemporaryDirectory() as folder:
-        runs = [once(cloud, model, Path(folder, "out.laz"), threads) for _ in range(repeats)]
-    line: dict[str, Any] = {"cloud": cloud.name, "points": points, "threads": threads}
-    for key in ("wall", "cpu", "memory"):
-        values = [run[key] for run in runs]
-        line[key] = [min(values), statistics.median(values), max(values)]
-    return line
+        commands = {
+            "pdal_stages": command("classify", cloud, Path(folder, "out.laz"), "--model", model)
+        }
+        if peer is not None:
+            commands["OpenPointClass"] = peer(cloud, Path(folder, "out.ply"))
+        runs: dict[str, list[dict[str, float]]] = {name: [] for name in commands}
+        for _ in range(repeats):
+            for name, words in commands.items():
+                runs[name].append(once(words, threads))
+    lines = []
+    for name, each in runs.items():
+        line: dict[str, Any] = {"cloud": cloud.name, "points": points, "threads": threads}
+        line["program"] = name
+        for key in ("wall", "cpu", "memory"):
+            values = [run[key] for run in each]
+            line[key] = [min(values), statistics.median(values), max(values)]
+        lines.append(line)
+    return lines
 
 
 def table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table."""
     out = [
-        "| cloud | points | threads | wall s | CPU s | CPU microseconds a point | memory, MiB | "
-        "bytes a point |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|",
+        "| cloud | points | program | threads | wall s | CPU s | least CPU microseconds a point | "
+        "memory, MiB | bytes a point |",
+        "|---|---:|---|---:|---:|---:|---:|---:|---:|",
     ]
     for line in lines:
         wall, cpu = (" / ".join(f"{v:.1f}" for v in line[key]) for key in ("wall", "cpu"))
         memory, points = line["memory"][1], line["points"]
         out.append(
-            f"| {line['cloud']} | {points:,} | {line['threads'] or 'all'} | {wall} | {cpu} | "
-            f"{1e6 * line['cpu'][1] / points:.1f} | {memory:.0f} | "
+            f"| {line['cloud']} | {points:,} | {line['program']} | {line['threads'] or 'all'} | "
+            f"{wall} | {cpu} | {1e6 * line['cpu'][0] / points:.1f} | {memory:.0f} | "
             f"{memory * 2**20 / points:.0f} |"
         )
     return "\n".join(out)
@@ -280,6 +333,9 @@ def main() -> None:
     )
     options.add_argument("--threads", type=int, nargs="+", default=[0], help="0: all")
     options.add_argument("--parts", action="store_true")
+    options.add_argument(
+        "--openpointclass", type=Path, metavar="FOLDER", help="its pctrain and pcclassify"
+    )
     options.add_argument("--model", help="a model file, or standard; by default one is trained")
     options.add_argument("--repeats", type=int, default=3)
     options.add_argument("--json", type=Path)
@@ -305,10 +361,14 @@ def main() -> None:
         result["parts"] = parts(clouds[0], model)
         print(table_of_parts(result["parts"], points))
     else:
+        peer = None
+        if arguments.openpointclass:
+            peer = partial(openpointclass, arguments.folder, arguments.openpointclass)
         result["runs"] = [
-            measured(cloud, model, arguments.repeats, threads)
+            line
             for cloud in clouds
             for threads in arguments.threads
+            for line in measured(cloud, model, arguments.repeats, threads, peer)
         ]
         print(table(result["runs"]))
     if arguments.json:
