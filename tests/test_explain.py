@@ -187,7 +187,7 @@ def test_options_after_the_model_and_stages_are_told(city, explain, tmp_path):
     _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 5)[:1])
     words = ["--vegetation-heights", "20,30", "--keep-sure", "0.9", "--bridges"]
     text, (each,) = explain(city, *places[0], *words)
-    assert each["computed"] == 3 and [step[1] for step in each["steps"]] == [5, 3, 3]
+    assert each["computed"] == 3 and [step[1] for step in each["steps"]] == [5, 3, 3, 3]
     assert "makes it 3 Low vegetation" in text and "--bridges" in text
 
 

@@ -43,6 +43,7 @@ MEDIUM_VEGETATION = 4
 HIGH_VEGETATION = 5
 BUILDING = 6
 WIRE = 14  #: conductors
+WIRES = (13, WIRE)  #: guard wires, too
 TOWER = 15  #: transmission towers
 BRIDGE = 17  #: bridge decks
 WATER = 9

@@ -34,7 +34,7 @@ _CLASSIFIER_OPTIONS = ("vegetation_heights", "keep_sure")
 def add_commands(parser: Parser) -> None:
     """Add ``classify``."""
     help = "Classify point clouds: ground, vegetation, buildings and more"
-    rare = ("ground", "dimensions", "metadata", "scheduler", "per")
+    rare = ("ground", "towers", "dimensions", "metadata", "scheduler", "per")
     add = parser.command("classify", _classify, help, overrides=True, progress=True, rare=rare)
     add("inputs", nargs="+", metavar="input", help=INPUTS)
     add("output", help="A file, a folder, or a name with # for the input's")
@@ -59,6 +59,7 @@ def add_request_options(add: Callable) -> None:
     add("--dimensions", metavar="LIST", help=dimensions)
     for flag, default, help in (
         ("--noise", True, "Mark noise, classes 7 and 18 (default: on)"),
+        ("--towers", True, "Find towers and poles that hold wires, class 15 (default: on)"),
         ("--bridges", False, "Find bridge decks, class 17"),
     ):
         add(flag, action=argparse.BooleanOptionalAction, default=default, help=help)
@@ -85,6 +86,7 @@ def request_of(options: argparse.Namespace) -> ClassifyRequest:
         listed,
         stage_options(options, *_CLASSIFIER_OPTIONS),
         noise=options.noise,
+        towers=options.towers,
         bridges=options.bridges,
         polygons=tuple(options.polygons),
         given_ground=options.ground == "given",

@@ -14,7 +14,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import NOISE, TERRAIN
+from ..base.asprs import NOISE, TERRAIN, WIRES
 from ..base.errors import StageError
 from ..base.grid import GridWindow, begins_run, cell_keys, cell_numbers, split_keys
 
@@ -35,7 +35,7 @@ CLASSES: dict[Kind, tuple[int, ...]] = {
     Kind.GROUND: TERRAIN,
     Kind.BUILDING: (6,),
     Kind.TREE: (4, 5),
-    Kind.SPAN: (13, 14),
+    Kind.SPAN: WIRES,
     Kind.DECK: (17,),
 }
 #: Width of a cell of the ground, in cells of the other kinds: ground below objects is sparse.

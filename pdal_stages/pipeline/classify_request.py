@@ -9,7 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..base.asprs import OVERLAP, TERRAIN
+from ..base.asprs import OVERLAP, TERRAIN, WIRE
+from ..base.dimensions import HEIGHT
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.json_types import StageJson
 from ..base.selections import split_selection
@@ -43,6 +44,7 @@ class ClassifyRequest:
     #: options of ``filters.modelclassifier``, such as ``keep_sure`` and ``vegetation_heights``
     classifier_options: Mapping[str, Any] = field(default_factory=dict)
     noise: bool = True  #: mark low and high noise first
+    towers: bool = True  #: find what holds wires, where the model has these
     bridges: bool = False  #: find bridge decks, where heights are those of `_GROUND`
     polygons: tuple[str, ...] = ()  #: as ``filters.polygons`` takes them
     given_ground: bool = False  #: points of the classes TERRAIN are the ground, and stay so
@@ -128,16 +130,19 @@ class ClassifyRequest:
         return stages, any(stage.get("given_ground") for stage in stages)
 
     def _corrections(self, keep_ground: bool) -> list[StageJson]:
-        """Return the stages after the classifier that were requested, polygons last."""
+        """Return the stages after the classifier: towers, bridges, polygons."""
         settled = self._settled
         shared: StageJson = {name: settled[name] for name in ("ignore", "keep") if name in settled}
         kept = split_selection(shared.get("keep", OVERLAP))
         stages: list[StageJson] = []
+        keep_more: StageJson = {}
+        if keep_ground:
+            keep_more["keep"] = [*(kept if isinstance(kept, list) else [kept]), *TERRAIN]
+        heights = HEIGHT.name in self.loaded.required_dimensions
+        if self.towers and heights and WIRE in self.loaded.codes:
+            stages.append({"type": "filters.towers", **shared, **keep_more})
         if self.bridges:
-            bridges = {"type": "filters.bridges", **shared}
-            if keep_ground:
-                bridges["keep"] = [*(kept if isinstance(kept, list) else [kept]), *TERRAIN]
-            stages.append(bridges)
+            stages.append({"type": "filters.bridges", **shared, **keep_more})
         if self.polygons:
             polygons = {"type": "filters.polygons", "polygons": list(self.polygons)}
             stages.append({**polygons, **shared})

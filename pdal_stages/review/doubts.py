@@ -26,7 +26,7 @@ def inputs_against(files: Sequence[str], places: Sequence[AskedPlace], model: st
     Where nothing can be told, the text is empty, and a message says why.
     """
     try:
-        request = ClassifyRequest(model, noise=False)
+        request = ClassifyRequest(model, noise=False, towers=False)
         return [_against(each) for each in explain_points(files, places, request, _REACH_M)]
     except StageError as error:
         print_messages(f"what speaks against the classes is not known: {error}")

@@ -9,6 +9,7 @@ from ..base.asprs import (
     BRIDGE,
     LOW_VEGETATION,
     MEDIUM_VEGETATION,
+    TOWER,
     UNCLASSIFIED,
     class_name,
 )
@@ -26,7 +27,13 @@ _OF_FIRST = 10
 #: are hedges and low roofs, and not the ground on slopes of up to 45 %.
 _HIGH_M = 2.25
 #: Options of `classify` that run stages after the model.
-_OPTIONS = {"filters.bridges": "--bridges", "filters.polygons": "--polygons"}
+_OPTIONS = {
+    "filters.towers": "towers",
+    "filters.bridges": "--bridges",
+    "filters.polygons": "--polygons",
+}
+#: Stages that run without an option, and are named where they change the class.
+_BY_DEFAULT = ("filters.towers",)
 #: Options of `classify` that give points a class that the model did not find.
 _MAKERS = {
     UNCLASSIFIED: "--keep-sure",
@@ -81,7 +88,11 @@ def _steps(told: Explanation) -> list[str]:
     """Return what each step after the model made of the class."""
     before, out = told.in_file if told.verdict is None else told.verdict.winner, []
     for name, code in told.steps:
+        if code == before and name in _BY_DEFAULT:
+            continue
         changes = "keeps the class" if code == before else f"makes it {_class(code)}"
+        if name == "filters.towers":
+            changes += ": part of something slender that holds wires"
         out.append(_row(_OPTIONS.get(name, name), changes))
         before = code
     return out or [_row("nothing", "none of them changes classes after the model")]
@@ -119,6 +130,7 @@ def _differences(told: Explanation) -> list[str]:
         )
     elif _is_changed(told):
         makers = ["--polygons", *filter(None, [_MAKERS.get(told.in_file)])]
+        makers += ["--no-towers"] if told.computed == TOWER else []
         out.append(
             "so the model of that run said the same, and the class was changed afterwards: by "
             f"hand, by {' or '.join(makers)},\nor --where left out a point that had it before"

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..base.columns import LazyColumns, SomeRows
 from ..base.errors import NoTerrainError, StageError
@@ -26,7 +27,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.runtime import ExpandedStage
 from ..pipeline.spatial_reference import Reference
 from ..stages.apply_model import ApplyModel
-from ..stages.base import Observer
+from ..stages.base import Observer, used_distances
 from ..stages.points import RESERVED
 from .explanation import AskedPlace
 
@@ -183,10 +184,15 @@ class Recording:
             near &= (axis >= asked.min() - reach) & (axis <= asked.max() + reach)
         rows = np.flatnonzero(near)
         self.rows_seen = np.searchsorted(rows, self.rows)
-        outside = np.ones(len(rows), np.float32)
+        xy = np.column_stack([x[rows], y[rows]])
+        outside = unit * cKDTree(xy[self.rows_seen]).query(xy, p=np.inf)[0]
         outside[self.rows_seen] = -1.0
-        for each in ours[first:]:
-            each.update_context(outside=_OUTSIDE)
+        after = [each.stage for each in ours[first:]]
+        used = used_distances(
+            [each.halo_m() for each in after], lambda m, n: after[m].sees_results_of(after[n])
+        )
+        for each, used_m in zip(ours[first:], used, strict=True):
+            each.update_context(outside=_OUTSIDE, used_m=used_m)
         part, known = SomeRows(seen, rows), {_OUTSIDE: outside}
         self.seen = run_stages(ours[first:], part, wkt, known, self._keep_classes)
         texts = [*pipeline.expanded.warnings, *pipeline.messages]

@@ -62,6 +62,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors"
     forgets = True
+    costly = True
     counts = {
         "rejected": "rejected as unreliable",
         "ignored": "noise and withheld points, not classified (ignore)",

@@ -37,6 +37,19 @@ def files_read(stages: Sequence[StageJson]) -> list[str]:
     return [str(stage["filename"]) for stage in readers if "filename" in stage]
 
 
+def used_distances(reaches_m: Sequence[float], sees: Callable[[int, int], bool]) -> list[float]:
+    """Return how far outside a tile later stages use the results of each stage, in meters.
+
+    `reaches_m` are how far each looks; `sees(m, n)` tells whether stage m reads at neighbors what
+    stage n before it makes.
+    """
+    used = [0.0] * len(reaches_m)
+    for n in reversed(range(len(used))):
+        for m in range(n + 1, len(used)):
+            used[n] = max(used[n], used[m] + (reaches_m[m] if sees(m, n) else 0.0))
+    return used
+
+
 class Observer(NamedTuple):
     """Functions that receive how stages come to their results."""
 
@@ -135,6 +148,9 @@ class Stage(ABC):
     example: ClassVar[JsonObject] = {}
     #: Whether it calls :meth:`Points.keep_only`: the next stage gets the points from PDAL anew.
     forgets: ClassVar[bool] = False
+    #: Whether its results cost much: later stages of tiles that look around read them from a round
+    #: before, and do not have them computed again in surroundings.
+    costly: ClassVar[bool] = False
     #: Whether points beyond the halo may matter; tiles then call :meth:`reach_of` and read farther.
     open_ended: ClassVar[bool] = False
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-from ..stages.base import Blocks
+from ..stages.base import Blocks, used_distances
 from .planned_stage import PlannedStage
 
 #: Meters; stages that look farther see saved results of the stages before them, which would
 #: otherwise be computed again in a wide halo. The shipped model looks 81, bridges 367; in between
-#: the value was not tuned.
+#: the value was not tuned. After a costly stage (:attr:`..stages.base.Stage.costly`) any does.
 _FAR_M = 96.0
 
 
@@ -52,14 +52,11 @@ def make_round(
 ) -> Round:
     """Return a round of the stages from `begin` to `end`, which look `reaches` (meters) far."""
     part, reaches = stages[begin:end], reaches[begin:end]
-    used, before = [0.0] * len(part), [0.0] * len(part)
+    before = [0.0] * len(part)
     for n, stage in enumerate(part):
         seen = [k for k in range(n) if stage.sees_results_of(part[k])]
         before[n] = max((reaches[k] + before[k] for k in seen), default=0.0)
-    for n in range(len(part) - 1, -1, -1):
-        for m in range(n + 1, len(part)):
-            reach = reaches[m] if part[m].sees_results_of(part[n]) else 0.0
-            used[n] = max(used[n], used[m] + reach)
+    used = used_distances(reaches, lambda m, n: part[m].sees_results_of(part[n]))
     halo = max((u + reach for u, reach in zip(used, reaches, strict=True)), default=0.0)
     distances = [RoundStage(*each) for each in zip(used, before, strict=True)]
     return Round(begin, end, distances, halo, list(saved), blocks)
@@ -76,7 +73,9 @@ def cut_into_rounds(stages: list[PlannedStage], reaches: list[float]) -> list[Ro
         only = not open_ended and not any(each.blocks for each in rounds)
         blocks = stage.ours.blocks() if stage.ours is not None and only else None
         changed = _changed_by(stages[:at])
-        if blocks is not None or (changed is not None and at > begin and reaches[at] > _FAR_M):
+        seen = [each for each in stages[begin:at] if stage.sees_results_of(each)]
+        least = 0.0 if any(each.ours and each.ours.costly for each in seen) else _FAR_M
+        if blocks is not None or (changed is not None and seen and reaches[at] > least):
             rounds.append(make_round(stages, reaches, begin, at, changed or [], blocks))
             begin = begin if changed is None else at
         if blocks is not None:

@@ -90,7 +90,7 @@ class _Showing(Algorithm):
 
 class _Classifying(_Showing):
     command = "classify"
-    listed = (*("dimensions", "noise", "bridges", "vegetation_heights", "polygons", "where"),)
+    listed = ("dimensions", "noise", "towers", "bridges", "vegetation_heights", "polygons", "where")
 
     def add_model(self):
         name = self.forms["models"][0] if self.forms["models"] else ""
@@ -538,7 +538,7 @@ class Explain(_Classifying):
         "from the run that classified the file. Give the options of that run. The text is in the "
         "log and under Processing > Results Viewer."
     )
-    listed = ("noise", "bridges", "vegetation_heights", "keep_sure")
+    listed = ("noise", "towers", "bridges", "vegetation_heights", "keep_sure")
     handled = ("cloud", "place", "points", "crs", "json", "model")
 
     def initAlgorithm(self, configuration=None):
