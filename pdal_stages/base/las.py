@@ -47,6 +47,11 @@ class LasHeader:
     offsets: tuple[float, ...]
     box: tuple[float, float, float, float]  #: (min x, min y, max x, max y)
 
+    @property
+    def extra_bytes(self) -> int:
+        """Return the bytes of a point beyond those of its format, which must be known."""
+        return self.point_bytes - POINT_BYTES[self.point_format]
+
 
 def named_las(path: str | os.PathLike) -> bool:
     """Return whether a file is named like a LAS, LAZ or COPC file."""
@@ -119,6 +124,11 @@ class Record(NamedTuple):
     data: int  #: offset of its data in the file
     length: int  #: bytes of its data
     after: bool  #: whether it stands behind the points
+
+    @property
+    def kind(self) -> tuple[bytes, int]:
+        """Return what it holds: its user id and record id."""
+        return self.user, self.number
 
 
 def records(file: BinaryIO, header: LasHeader) -> Iterator[Record]:

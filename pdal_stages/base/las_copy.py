@@ -7,11 +7,13 @@ decoded and encoded again but the compression.
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ from .errors import DimensionError, OptionError, StageError
 from .las import PROJECTION, Record, end_of_points, records
 from .las_points import (
     MOST_ENTRIES,
+    Field,
     Layout,
     bytes_of,
     describe,
@@ -43,14 +46,6 @@ _DESCRIPTIONS = (b"LASF_Spec", 4)
 _COMPRESSION = (b"laszip encoded", 22204)
 #: Bit of the header's global encoding that says that the reference system is well-known text.
 _WKT_BIT = 16
-
-
-def _kind(record: Record) -> tuple[bytes, int]:
-    return record.user, record.number
-
-
-def _is_copied(record: Record, replaces_projection: bool) -> bool:
-    return record.user != b"copc" and not (replaces_projection and record.user == PROJECTION)
 
 
 class LasCopy:
@@ -83,31 +78,29 @@ class LasCopy:
         added: Mapping[str, np.dtype],
         projection: Sequence[tuple[int, bytes]] | None = None,
     ) -> None:
-        self.layout, self.source = layout, source
-        self.replaced = {
-            name: layout.extra_by_name[name] for name in added if name in layout.extra_by_name
-        }
         refuse_narrow(source, layout, added)
-        self.added = {n: np.dtype(kind) for n, kind in added.items() if n not in self.replaced}
-        self.at: dict[str, int] = {}  #: byte of a record at which each begins
-        self.point_bytes = layout.header.point_bytes
-        for name, kind in self.added.items():
-            self.at[name] = self.point_bytes
+        self.layout, self.source = layout, source
+        self.replaced = [name for name in added if name in layout.extra_by_name]
+        self.fields, self.added = layout.fields.copy(), []
+        header = layout.header
+        self.point_bytes = header.point_bytes
+        for name in (name for name in added if name not in self.replaced):
+            kind = np.dtype(added[name]).newbyteorder("<")
+            self.fields[name] = Field(name, self.point_bytes, kind, kind, "")
+            self.added.append(name)
             self.point_bytes += kind.itemsize
         self.compressed = compressed
         self.projection = projection
         self.count = 0
-        header = layout.header
         with open(source, "rb") as file:
             self._head = file.read(header.offset)
             listed = list(islice(records(file, header), header.records + header.records_after))
         self._before = [r for r in listed if not r.after and r.data + r.length <= header.offset]
         self._behind = [record for record in listed if record.after]
-        described = (r for r in (*self._before, *self._behind) if _kind(r) == _DESCRIPTIONS)
+        described = (r for r in (*self._before, *self._behind) if r.kind == _DESCRIPTIONS)
         #: The record that gets all descriptions; None where one must be made.
         self._holder = next(described, None)
-        self._entries = self._described() if self.added else []
-        self._coding: Any = None
+        self._descriptions = b"".join(self._described()) if self.added else b""
         self._file: Any = None
         self._encoder: Any = None
 
@@ -121,22 +114,32 @@ class LasCopy:
         """
         with open(target, "w+b") as self._file:
             self._file.write(self._assembled_head())
-            self._encoder = self._make_encoder() if self.compressed else None
+            if self.compressed:
+                import lazrs
+
+                self._encoder = lazrs.ParLasZipCompressor(self._file, self._coding)
             yield self
             self._finish()
+
+    @cached_property
+    def _coding(self) -> Any:
+        import lazrs
+
+        header = self.layout.header
+        room = self.point_bytes - header.point_bytes + header.extra_bytes
+        return lazrs.LazVlr.new_for_compression(header.point_format, room)
 
     def _described(self) -> list[bytes]:
         """Return descriptions of all extra bytes of the copy."""
         entries = entries_of(self.layout.described)
-        room = self.layout.header.point_bytes - _plain_bytes(self.layout)
-        missing = room - sum(map(size_of_entry, entries))
+        missing = self.layout.header.extra_bytes - sum(map(size_of_entry, entries))
         most = MOST_ENTRIES - len(entries) - len(self.added)
         # Bytes that nobody describes: one by one, or three by three where they are many.
         while missing > 0:
             triple = missing >= 3 and missing > most
             entries.append(describe(f"undescribed{missing}", 21 if triple else 1))
             missing, most = missing - (3 if triple else 1), most - 1
-        entries += [describe(name, kind) for name, kind in self.added.items()]
+        entries += [describe(name, self.fields[name].type) for name in self.added]
         if len(entries) > MOST_ENTRIES:
             raise DimensionError(
                 f"a LAS file describes at most {MOST_ENTRIES} extra dimensions",
@@ -146,45 +149,48 @@ class LasCopy:
             )
         return entries
 
-    def _changed(self, record: Record, bytes_: bytes) -> bytes | None:
-        """Return a record of the copy, with its head; None where it has none."""
-        if not _is_copied(record, self.projection is not None):
-            return None
-        kind = _kind(record)
-        if kind == _COMPRESSION:
-            return _with_data(record, bytes_, self._compression()) if self.compressed else None
-        if kind == _DESCRIPTIONS and self._entries:
-            if record != self._holder:
-                return None
-            return _with_data(record, bytes_, b"".join(self._entries))
-        return bytes_
+    def _drops(self, record: Record) -> bool:
+        """Return whether the copy has none of a record."""
+        if record.kind == _DESCRIPTIONS:
+            return bool(self._descriptions) and record != self._holder
+        if record.kind == _COMPRESSION:
+            return not self.compressed
+        return record.user == b"copc" or (self.projection is not None and record.user == PROJECTION)
 
-    def _compression(self) -> bytes:
-        """Return the data of the record on compression."""
-        import lazrs
+    def _edits(self, listed: Sequence[Record]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield from where to where the input's bytes of records are others in the copy, and which.
 
-        header = self.layout.header
-        room = self.point_bytes - _plain_bytes(self.layout)
-        self._coding = lazrs.LazVlr.new_for_compression(header.point_format, room)
-        return self._coding.record_data()
+        They are in the order of the file.
+        """
+        for record in listed:
+            if self._drops(record):
+                yield record.place, record.data + record.length, b""
+            elif data := self._changed(record):
+                length = struct.pack("<Q", len(data))[: 8 if record.after else 2]
+                yield record.place + 20, record.place + 20 + len(length), length
+                yield record.data, record.data + record.length, data
+
+    def _changed(self, record: Record) -> bytes:
+        """Return the data of a record that changes; empty for others."""
+        if record.kind == _COMPRESSION:
+            return self._coding.record_data()
+        return self._descriptions if record.kind == _DESCRIPTIONS else b""
 
     def _assembled_head(self) -> bytes:
         """Return what stands before the points in the copy."""
-        header, old, fits = self.layout.header, self._head, self._before
-        end = max((r.data + r.length for r in fits), default=header.header_bytes)
-        kept = [self._changed(r, old[r.place : r.data + r.length]) for r in fits]
-        parts = [part for part in kept if part is not None]
-        if self._entries and self._holder is None:
-            parts.append(_record(*_DESCRIPTIONS, b"Extra Bytes Record", b"".join(self._entries)))
-        for number, data in self.projection or ():
-            parts.append(_record(PROJECTION, number, b"", data))
-        if self.compressed and self._coding is None:
-            parts.append(_record(*_COMPRESSION, b"https://laszip.org", self._compression()))
-        if large := next((part for part in parts if len(part) > 54 + 65_535), None):
-            raise StageError("a record of the copy is too long", found=f"{len(large):,} bytes")
-        head = bytearray(old[: header.header_bytes] + b"".join(parts) + old[end:])
-        struct.pack_into("<I", head, 96, len(head))
-        struct.pack_into("<I", head, 100, header.records + len(parts) - len(fits))
+        header, head = self.layout.header, bytearray(self._head)
+        parts = [_record(PROJECTION, number, b"", data) for number, data in self.projection or ()]
+        if self._descriptions and self._holder is None:
+            parts.insert(0, _record(*_DESCRIPTIONS, b"Extra Bytes Record", self._descriptions))
+        if self.compressed and all(record.kind != _COMPRESSION for record in self._before):
+            data = self._coding.record_data()
+            parts.append(_record(*_COMPRESSION, b"https://laszip.org", data))
+        end = max((r.data + r.length for r in self._before), default=header.header_bytes)
+        head[end:end] = b"".join(parts)
+        for start, stop, data in reversed([*self._edits(self._before)]):
+            head[start:stop] = data
+        count = header.records + len(parts) - sum(map(self._drops, self._before))
+        struct.pack_into("<II", head, 96, len(head), count)
         head[104] = header.point_format | (0x80 if self.compressed else 0)
         struct.pack_into("<H", head, 105, self.point_bytes)
         if self.projection:
@@ -192,40 +198,26 @@ class LasCopy:
             head[6] = head[6] & ~_WKT_BIT | (_WKT_BIT if text else 0)
         return bytes(head)
 
-    def _make_encoder(self) -> Any:
-        import lazrs
-
-        return lazrs.ParLasZipCompressor(self._file, self._coding)
-
     # ---- points ----------------------------------------------------------------------------------
 
     def write(self, part: NDArray, values: Mapping[str, NDArray]) -> None:
         """Write records (n,) of the input with new values (n,) of Classification and others."""
-        part = part.copy()
-        if "Classification" in values:
-            self._check_codes(values["Classification"])
-        for name, column in values.items():
-            if name in self.layout.names and name not in self.replaced:
-                self.layout.put(part, name, column)
-        old = bytes_of(part)
-        new = np.zeros((len(part), self.point_bytes), np.uint8)
-        new[:, : old.shape[1]] = old
-        for name, column in values.items():
+        new = np.zeros(len(part), np.dtype((np.void, self.point_bytes)))
+        raw = bytes_of(new)
+        raw[:, : part.itemsize] = bytes_of(part)
+        for name in values.keys() & self.fields.keys():
+            field, column = self.fields[name], values[name]
+            if name == "Classification":
+                self._check_codes(column)
             if name in self.replaced:
-                field = self.replaced[name]
-                at = old.shape[1] - self.layout.dtype["extra"].itemsize + field.at
-                new[:, at : at + field.type.itemsize] = _as_bytes(
-                    held_in(column, field.type, name, self.source), field.type
-                )
-            elif name in self.added:
-                kind = self.added[name]
-                new[:, self.at[name] : self.at[name] + kind.itemsize] = _as_bytes(column, kind)
+                column = held_in(column, field.type, name, self.source)
+            field.write(new, column)
         if self._encoder is None:
-            self._file.write(new)
-        elif len(new):
+            self._file.write(raw)
+        elif len(raw):
             with _compressing():
-                self._encoder.compress_many(new.reshape(-1))
-        self.count += len(new)
+                self._encoder.compress_many(raw.reshape(-1))
+        self.count += len(raw)
 
     def _check_codes(self, codes: NDArray) -> None:
         """Refuse classes that have no room beside the flags of formats 0 to 5."""
@@ -246,63 +238,46 @@ class LasCopy:
             with _compressing():
                 self._encoder.done()
             self._encoder = None  # which holds the file
-        file.seek(0, 2)
+        file.seek(0, os.SEEK_END)
+        shifts = self._write_tail()
+
         if self.count != header.count:
-            file.seek(107)
-            file.write(struct.pack("<I", self.count if self.layout.is_old else 0))
+            self._patch(107, "<I", self.count if self.layout.is_old else 0)
             if header.minor >= 4:
-                file.seek(247)
-                file.write(struct.pack("<Q", self.count))
-            file.seek(0, 2)
-        with open(self.source, "rb") as source:
-            places = self._copy_tail(source)
+                self._patch(247, "<Q", self.count)
         if header.waveforms:
-            file.seek(227)
-            file.write(struct.pack("<Q", places.get(header.waveforms, 0)))
+            self._patch(227, "<Q", _moved(header.waveforms, shifts))
         if header.records_after:
-            kept = [r for r in self._behind if places.get(r.place)]
-            file.seek(235)
-            gone = len(self._behind) - len(kept)
-            first = places[kept[0].place] if kept else 0
-            file.write(struct.pack("<QI", first, header.records_after - gone))
+            kept = [record.place for record in self._behind if not self._drops(record)]
+            self._patch(235, "<QI", _moved(kept[0], shifts) if kept else 0, len(kept))
         file.flush()
 
-    def _copy_tail(self, source: BinaryIO) -> dict[int, int]:
-        """Copy what stands behind the points; return places in the copy by those in the input."""
-        header, out = self.layout.header, self._file
-        size = source.seek(0, 2)
-        at = end_of_points(header, size)
-        if not header.compressed:
-            at = min(at, header.offset + header.count * header.point_bytes)
-        places: dict[int, int] = {}
-        for record in self._behind:
-            end = record.data + record.length
-            if record.place < at or end > size:
-                break
-            self._copy_bytes(source, at, record.place, places)
-            head = _bytes(source, record.place, record.data)
-            changes = _kind(record) == _DESCRIPTIONS and bool(self._entries)
-            data = _data(source, record) if changes else b""
-            new = self._changed(record, head + data)
-            if new is not None:
-                places[record.place] = out.tell()
-                out.write(new)
-                if not changes:
-                    self._copy_bytes(source, record.data, end, places)
-            at = end
-        self._copy_bytes(source, at, size, places)
-        return places
+    def _patch(self, place: int, kinds: str, *values: int) -> None:
+        """Write numbers into the header of the copy."""
+        self._file.seek(place)
+        self._file.write(struct.pack(kinds, *values))
 
-    def _copy_bytes(self, source: BinaryIO, start: int, end: int, places: dict[int, int]) -> None:
-        """Copy bytes of the input, and note where waveforms come to stand."""
-        shift = self._file.tell() - start
-        if start <= (waveforms := self.layout.header.waveforms) < end:
-            places[waveforms] = waveforms + shift
-        source.seek(start)
-        left = end - start
-        while left > 0 and (data := source.read(min(left, 1 << 22))):
-            self._file.write(data)
-            left -= len(data)
+    def _write_tail(self) -> list[tuple[int, int]]:
+        """Copy what stands behind the points.
+
+        Return places in the input, and by how much the bytes from there on have moved in the copy.
+        """
+        header, out = self.layout.header, self._file
+        with open(self.source, "rb") as source:
+            size = source.seek(0, os.SEEK_END)
+            at = end_of_points(header, size)
+            if not header.compressed:
+                at = min(at, header.offset + header.count * header.point_bytes)
+            shifts = []
+            for start, end, data in (*self._edits(self._behind), (size, size, b"")):
+                shifts.append((at, out.tell() - at))
+                source.seek(at)
+                while at < start and (part := source.read(min(start - at, 1 << 22))):
+                    out.write(part)
+                    at += len(part)
+                out.write(data)
+                at = end
+        return shifts
 
 
 @contextlib.contextmanager
@@ -324,8 +299,10 @@ def refuse_narrow(source: str, layout: Layout, added: Mapping[str, np.dtype]) ->
         if field is None:
             continue
         fits = field.type.kind == np.dtype(kind).kind == "f" or np.can_cast(kind, field.type)
-        if field.is_scaled or not fits:
-            raise _narrow(source, name, f"{field.type.name}{', scaled' * field.is_scaled}")
+        if field.scale is not None or not fits:
+            raise _narrow(
+                source, name, f"{field.type.name}{', scaled' * (field.scale is not None)}"
+            )
 
 
 def held_in(values: NDArray, kind: np.dtype, name: str, source: str) -> NDArray:
@@ -345,34 +322,14 @@ def _narrow(source: str, name: str, kind: str) -> DimensionError:
     )
 
 
-def _as_bytes(values: NDArray, kind: np.dtype) -> NDArray[np.uint8]:
-    """Return values (n,) as the bytes (n, size) of a little-endian type."""
-    plain = np.ascontiguousarray(values, kind.newbyteorder("<"))
-    return plain.view(np.uint8).reshape(len(plain), kind.itemsize)
-
-
-def _plain_bytes(layout: Layout) -> int:
-    extra = layout.dtype["extra"].itemsize if "extra" in (layout.dtype.names or ()) else 0
-    return layout.header.point_bytes - extra
-
-
 def _record(user: bytes, number: int, title: bytes, data: bytes) -> bytes:
     """Return a record before the points."""
-    return struct.pack("<H16sHH32s", 0, user, number, len(data) & 0xFFFF, title) + data
+    if len(data) > 65_535:
+        raise StageError("a record of the copy is too long", found=f"{len(data):,} bytes")
+    return struct.pack("<H16sHH32s", 0, user, number, len(data), title) + data
 
 
-def _with_data(record: Record, bytes_: bytes, data: bytes) -> bytes:
-    """Return a record with other data."""
-    size = record.data - record.place
-    length = struct.pack("<Q", len(data))[: 8 if record.after else 2]
-    return bytes_[:20] + length + bytes_[20 + len(length) : size] + data
-
-
-def _data(source: BinaryIO, record: Record) -> bytes:
-    """Return the data of a record."""
-    return _bytes(source, record.data, record.data + record.length)
-
-
-def _bytes(source: BinaryIO, start: int, end: int) -> bytes:
-    source.seek(start)
-    return source.read(end - start)
+def _moved(place: int, shifts: Sequence[tuple[int, int]]) -> int:
+    """Return where a byte of the input stands in the copy; 0 where it was not copied."""
+    moved = [place + shift for start, shift in shifts if start <= place]
+    return moved[-1] if moved else 0

@@ -11,7 +11,7 @@ import functools
 import operator
 import os
 import struct
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -90,19 +90,46 @@ _LAYERS = {
 }  # fmt: skip
 
 
-class ExtraField(NamedTuple):
-    """Extra bytes that are one dimension."""
+class Field(NamedTuple):
+    """A dimension in a record: bytes, or bits of a byte, and what their number stands for."""
 
-    name: str  #: in the file; an element of an array has its number behind it
-    at: int  #: byte of the extra bytes at which it begins
-    type: np.dtype
-    scale: float = 1.0
+    name: str  #: an element of an array of extra bytes has its number behind it
+    at: int  #: byte of the record at which it begins
+    type: np.dtype  #: of the bytes
+    kind: np.dtype  #: of the values
+    layer: str  #: what lazrs must decode of LAZ 1.4; empty for what it always does
+    scale: float | None = None  #: None where the number is the value
     shift: float = 0.0
+    low: int = 0  #: the lowest bit
+    bits: int = 0  #: number of bits; 0 for whole bytes
 
-    @property
-    def is_scaled(self) -> bool:
-        """Return whether its values are numbers times a scale, plus an offset."""
-        return self.scale != 1.0 or self.shift != 0.0
+    def numbers(self, records: NDArray) -> NDArray:
+        """Return the numbers (n,) that records (n,) hold, as a view of their bytes."""
+        return records.getfield(self.type, self.at)
+
+    def scaled(self, numbers: NDArray) -> NDArray:
+        """Return the values (n,) of numbers (n,)."""
+        if self.scale is None:
+            return numbers.astype(self.kind)
+        return (numbers * self.scale + self.shift).astype(self.kind, copy=False)
+
+    def read(self, records: NDArray) -> NDArray:
+        """Return the values (n,) that records (n,) hold."""
+        numbers = self.numbers(records)
+        if self.bits:
+            return numbers >> np.uint8(self.low) & np.uint8((1 << self.bits) - 1)
+        return self.scaled(numbers)
+
+    def write(self, records: NDArray, values: NDArray) -> None:
+        """Set the values (n,) of records (n,); one that does not fit is cut off."""
+        numbers = self.numbers(records)
+        if self.scale is not None:
+            values = np.rint((values - self.shift) / self.scale)
+        if self.bits:
+            mask = np.uint8(((1 << self.bits) - 1) << self.low)
+            values = np.asarray(values).astype(np.uint8) << np.uint8(self.low) & mask
+            values = numbers & ~mask | values
+        numbers[...] = values
 
 
 def decode_text(field: bytes) -> str:
@@ -129,7 +156,7 @@ def entries_of(data: bytes) -> list[bytes]:
     return [data[at : at + ENTRY] for at in range(0, len(data) - ENTRY + 1, ENTRY)]
 
 
-def extra_fields(header: LasHeader, data: bytes) -> list[ExtraField]:
+def extra_fields(header: LasHeader, data: bytes) -> list[Field]:
     """Return the dimensions that descriptions of extra bytes name.
 
     Raises
@@ -137,7 +164,7 @@ def extra_fields(header: LasHeader, data: bytes) -> list[ExtraField]:
     StageError
         Where they do not fit the points.
     """
-    fields, at = [], 0
+    fields, at = [], header.point_bytes - header.extra_bytes
     for entry in entries_of(data):
         count, name = (entry[2] - 1) // 10 + 1, decode_text(entry[4:36])
         size = size_of_entry(entry)
@@ -146,15 +173,18 @@ def extra_fields(header: LasHeader, data: bytes) -> list[ExtraField]:
             scale, shift = (struct.unpack_from("<d", entry, byte + 8 * n)[0] for byte in _NUMBERS)
             scale = scale if entry[3] & _SCALED else 1.0
             shift = shift if entry[3] & _SHIFTED else 0.0
-            title = name if count == 1 else f"{name}{n}"
-            fields.append(ExtraField(title, at + n * kind.itemsize, kind, scale, shift))
+            plain = scale == 1.0 and shift == 0.0
+            title, begin = name if count == 1 else f"{name}{n}", at + n * kind.itemsize
+            values = kind.newbyteorder("=") if plain else np.dtype(float)
+            layer = _LAYERS["extra"]
+            fields.append(Field(title, begin, kind, values, layer, None if plain else scale, shift))
         at += size
-    room = header.point_bytes - POINT_BYTES[header.point_format]
-    if at > room:
+    if at > header.point_bytes:
+        room = header.extra_bytes
         raise StageError(
             "the LAS file is damaged: its points are shorter than the descriptions of their "
             "extra bytes",
-            found=f"{at:,} bytes described, {room:,} there",
+            found=f"{at - header.point_bytes + room:,} bytes described, {room:,} there",
         )
     return fields
 
@@ -180,7 +210,7 @@ class Layout:
     """The layout of a file's records: where each dimension of its points stands."""
 
     header: LasHeader
-    extra: tuple[ExtraField, ...] = ()
+    extra: tuple[Field, ...] = ()
     described: bytes = b""  #: the descriptions that `extra` comes from
 
     @classmethod
@@ -198,12 +228,10 @@ class Layout:
         data = description(path) if described is None else described
         return cls(header, tuple(extra_fields(header, data)), data)
 
-    @cached_property
+    @property
     def dtype(self) -> np.dtype:
-        """Return the type of a record."""
-        fields = (_OLD if self.is_old else _NEW) + _MORE[self.header.point_format]
-        room = self.header.point_bytes - POINT_BYTES[self.header.point_format]
-        return np.dtype([*fields, ("extra", f"V{room}")] if room else fields)
+        """Return the type of a record, whose bytes :attr:`fields` tells."""
+        return np.dtype((np.void, self.header.point_bytes))
 
     @property
     def is_old(self) -> bool:
@@ -211,84 +239,30 @@ class Layout:
         return self.header.point_format <= 5
 
     @cached_property
-    def _bits(self) -> dict[str, tuple[str, int, int]]:
-        return _OLD_BITS if self.is_old else _NEW_BITS
+    def fields(self) -> dict[str, Field]:
+        """Return all dimensions by name; extra bytes named like one of the format are none."""
+        header, double = self.header, np.dtype(float)
+        listed = np.dtype((_OLD if self.is_old else _NEW) + _MORE[header.point_format])
+        axes = zip(AXES, header.scales, header.offsets, strict=True)
+        scales: dict[str, tuple[np.dtype, float | None, float]]
+        scales = {axis: (double, scale, shift) for axis, scale, shift in axes}
+        step = 1.0 if self.is_old else _ANGLE_STEP
+        scales["ScanAngleRank"] = np.dtype(np.float32), step, 0.0
+        parts: dict[str, Field] = {}
+        for name, (kind, at, *_) in (listed.fields or {}).items():
+            values, scale, shift = scales.get(name, (kind.newbyteorder("="), None, 0.0))
+            parts[name] = Field(name, at, kind, values, _LAYERS.get(name, ""), scale, shift)
+        fields = {name: part for name, part in parts.items() if name[0].isupper()}
+        for name, (part, low, bits) in (_OLD_BITS if self.is_old else _NEW_BITS).items():
+            fields[name] = parts[part]._replace(name=name, low=low, bits=bits)
+        extra = {each.name: each for each in self.extra if each.name not in {"", *fields}}
+        return fields | extra
 
     @cached_property
-    def extra_by_name(self) -> dict[str, ExtraField]:
+    def extra_by_name(self) -> dict[str, Field]:
         """Return extra dimensions by name, but those that are named like one of the format."""
-        taken = {*self._bits, *(self.dtype.names or ())}
-        return {each.name: each for each in self.extra if each.name and each.name not in taken}
-
-    @cached_property
-    def names(self) -> list[str]:
-        """Return all dimensions."""
-        fields = [name for name in self.dtype.names or () if name[0].isupper()]
-        return [*fields, *self._bits, *self.extra_by_name]
-
-    def type_of(self, name: str) -> np.dtype:
-        """Return the type of a dimension's values."""
-        if name in AXES:
-            return np.dtype(float)
-        if name in self.extra_by_name:
-            each = self.extra_by_name[name]
-            return np.dtype(float) if each.is_scaled else each.type.newbyteorder("=")
-        if name == "ScanAngleRank":
-            return np.dtype(np.float32)
-        return np.dtype("u1") if name in self._bits else self.dtype[name].newbyteorder("=")
-
-    def column(self, records: NDArray, name: str) -> NDArray:
-        """Return a dimension (n,) of records (n,); KeyError for an unknown one."""
-        if name in self._bits:
-            field, low, count = self._bits[name]
-            return records[field] >> np.uint8(low) & np.uint8((1 << count) - 1)
-        if name in self.extra_by_name:
-            each = self.extra_by_name[name]
-            raw = extra_bytes(records)[:, each.at : each.at + each.type.itemsize]
-            values = np.ascontiguousarray(raw).view(each.type)[:, 0]
-            if each.is_scaled:
-                return values * each.scale + each.shift
-            return values.astype(self.type_of(name), copy=False)
-        if name not in (self.dtype.names or ()) or not name[0].isupper():
-            raise KeyError(name)
-        values = records[name]
-        if name in AXES:
-            return self.scaled(name, values)
-        if name == "ScanAngleRank" and not self.is_old:
-            values = values * _ANGLE_STEP
-        return values.astype(self.type_of(name))
-
-    def scaled(self, axis: str, steps: NDArray) -> NDArray[np.float64]:
-        """Return coordinates (n,) along X, Y or Z of the whole numbers that records hold."""
-        number = AXES.index(axis)
-        return steps * self.header.scales[number] + self.header.offsets[number]
-
-    def put(self, records: NDArray, name: str, values: NDArray) -> None:
-        """Set a dimension (n,) of records (n,); a value that does not fit is cut off."""
-        if name in self.extra_by_name:
-            each = self.extra_by_name[name]
-            steps = np.rint((values - each.shift) / each.scale) if each.is_scaled else values
-            raw = extra_bytes(records)[:, each.at : each.at + each.type.itemsize]
-            raw[:] = np.ascontiguousarray(steps, each.type).view(np.uint8).reshape(raw.shape)
-        elif name in self._bits:
-            field, low, count = self._bits[name]
-            mask = np.uint8(((1 << count) - 1) << low)
-            new = np.asarray(values).astype(np.uint8) << np.uint8(low) & mask
-            records[field] = records[field] & ~mask | new
-        elif name in AXES:
-            axis = AXES.index(name)
-            steps = (values - self.header.offsets[axis]) / self.header.scales[axis]
-            records[name] = np.rint(steps)
-        elif name == "ScanAngleRank" and not self.is_old:
-            records[name] = np.rint(values / _ANGLE_STEP)
-        else:
-            records[name] = values
-
-    def layers(self, names: Iterable[str]) -> set[str]:
-        """Return what lazrs must decode for some dimensions."""
-        fields = {self._bits[n][0] if n in self._bits else n for n in names}
-        fields = {"extra" if name in self.extra_by_name else name for name in fields}
-        return {_LAYERS[name] for name in fields if name in _LAYERS}
+        held = {each.name: each for each in self.extra}
+        return {name: each for name, each in self.fields.items() if held.get(name) is each}
 
 
 def layout_there(path: str | os.PathLike) -> Layout | None:
@@ -297,12 +271,6 @@ def layout_there(path: str | os.PathLike) -> Layout | None:
         return Layout.of_file(path)
     except (OSError, ValueError, IndexError, StageError):
         return None
-
-
-def extra_bytes(records: NDArray) -> NDArray[np.uint8]:
-    """Return the extra bytes (n, bytes) of records (n,), as a view."""
-    size = records.dtype["extra"].itemsize
-    return bytes_of(records)[:, -size:]
 
 
 def bytes_of(records: NDArray) -> NDArray[np.uint8]:
@@ -374,7 +342,8 @@ def _parts(
     import lazrs
 
     coding = laszip_record(file, header)
-    layers = ["ALL"] if only is None else ["XY_RETURNS_CHANNEL", *layout.layers(only)]
+    layers = {layout.fields[name].layer for name in only or () if name in layout.fields}
+    layers = {"ALL"} if only is None else {"XY_RETURNS_CHANNEL", *layers} - {""}
     bits = [getattr(lazrs, f"SELECTIVE_DECOMPRESS_{layer}") for layer in layers]
     selection = lazrs.DecompressionSelection(functools.reduce(operator.or_, bits))
     if lazrs.LazVlr(coding).item_size() != dtype.itemsize:
@@ -398,78 +367,62 @@ USUAL = ("X", "Y", "Z", "Classification", "ReturnNumber", "NumberOfReturns", "Wi
 
 @dataclass(eq=False)
 class LasColumns(LazyColumns):
-    """The dimensions of a file by name, each read when it is asked for and then kept.
+    """The dimensions of files or records, one after the other, by name; 0 where a part has none.
 
-    Coordinates are kept as the whole numbers of the file, in half the memory.
+    Each is read when it is asked for and then kept. Coordinates of a single part are kept as its
+    whole numbers, in half the memory.
     """
 
-    path: str
-    layout: Layout
+    parts: Sequence[tuple[Layout, str | NDArray]]  #: files by their paths, or records (n,)
     _read: dict[str, NDArray] = field(default_factory=dict)
 
-    @property
-    def names(self) -> Collection[str]:
-        """Return the names of the dimensions."""
-        return self.layout.names
+    @cached_property
+    def names(self) -> Collection[str]:  # type: ignore[override]
+        """Return the names of the dimensions, in the order of the parts."""
+        return dict.fromkeys(name for layout, _ in self.parts for name in layout.fields).keys()
 
     def __getitem__(self, name: str) -> NDArray:
         """Return a dimension (n,)."""
         if name not in self._read:
-            if name not in self.layout.names:
+            if name not in self:
                 raise KeyError(name)
-            wanted = USUAL if name in USUAL and not self._read.keys() & {*USUAL} else (name,)
-            self.load([each for each in wanted if each in self.layout.names])
+            usual = name in USUAL and not self._read.keys() & {*USUAL}
+            self.load([each for each in (USUAL if usual else (name,)) if each in self])
         values = self._read[name]
-        return self.layout.scaled(name, values) if name in AXES else values
+        return self.parts[0][0].fields[name].scaled(values) if self._is_whole(name) else values
+
+    def _is_whole(self, name: str) -> bool:
+        return name in AXES and len(self.parts) == 1
 
     def load(self, names: Sequence[str]) -> None:
         """Read dimensions, all in one pass."""
-        layout, at = self.layout, 0
-        kinds = {n: layout.dtype[n] if n in AXES else layout.type_of(n) for n in names}
-        new = {name: np.empty(layout.header.count, kind) for name, kind in kinds.items()}
-        for records in read_records(self.path, layout, only=names):
-            for name, values in new.items():
-                part = records[name] if name in AXES else layout.column(records, name)
-                values[at : at + len(records)] = part
-            at += len(records)
+        counts = [len(s) if isinstance(s, np.ndarray) else at.header.count for at, s in self.parts]
+        new: dict[str, NDArray] = {}
+        for name in names:
+            fields = [layout.fields[name] for layout, _ in self.parts if name in layout.fields]
+            kinds = [each.type if self._is_whole(name) else each.kind for each in fields]
+            new[name] = np.zeros(sum(counts), np.result_type(*kinds))
+        at = 0
+        for layout, source in self.parts:
+            there = [name for name in names if name in layout.fields]
+            if isinstance(source, str):
+                parts = read_records(source, layout, only=there)
+            else:
+                parts = iter([source])
+            for records in parts:
+                rows = slice(at, at + len(records))
+                at = rows.stop
+                for name in there:
+                    read = Field.numbers if self._is_whole(name) else Field.read
+                    new[name][rows] = read(layout.fields[name], records)
         self._read |= new
 
 
-def columns_of_files(paths: Sequence[str]) -> RecordColumns:
-    """Return the dimensions of all points of files, one after the other."""
-    parts: list[tuple[Layout, NDArray]] = []
+def columns_of_files(paths: Sequence[str]) -> LasColumns:
+    """Return the dimensions of all points of files, whose records are kept in memory."""
+    parts: list[tuple[Layout, str | NDArray]] = []
     for path in paths:
         layout = Layout.of_file(path)
         records = [np.empty(0, layout.dtype), *read_records(path, layout)]
         parts.append((layout, np.concatenate(records)))
-    return RecordColumns(parts)
-
-
-@dataclass(eq=False)
-class RecordColumns(LazyColumns):
-    """The dimensions of records of several files together, by name; 0 where a file has none."""
-
-    parts: Sequence[tuple[Layout, NDArray]]
-    _made: dict[str, NDArray] = field(default_factory=dict)
-
-    @cached_property
-    def names(self) -> Collection[str]:  # type: ignore[override]
-        """Return the names of the dimensions, in the order of the files."""
-        return dict.fromkeys(name for layout, _ in self.parts for name in layout.names).keys()
-
-    def __getitem__(self, name: str) -> NDArray:
-        """Return a dimension (n,)."""
-        if name not in self._made:
-            if name not in self:
-                raise KeyError(name)
-            there = [layout.type_of(name) for layout, _ in self.parts if name in layout.names]
-            kind = np.result_type(*there)
-            self._made[name] = np.concatenate(
-                [
-                    layout.column(records, name).astype(kind, copy=False)
-                    if name in layout.names
-                    else np.zeros(len(records), kind)
-                    for layout, records in self.parts
-                ]
-            )
-        return self._made[name]
+    return LasColumns(parts)

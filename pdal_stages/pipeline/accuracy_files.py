@@ -125,7 +125,7 @@ def _read(source: str) -> Points:
     if is_las(source):
         check_readable(source)
         wkt, _ = text_of({"type": "readers.las", "filename": source})
-        return Points(LasColumns(source, Layout.of_file(source)), wkt=wkt)
+        return Points(LasColumns([(Layout.of_file(source), source)]), wkt=wkt)
     pipeline = Pipeline([reader_of(source, "input")])
     pipeline.execute()
     return points_of_views(pipeline.arrays, pipeline.metadata)

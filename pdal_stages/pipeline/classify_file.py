@@ -76,7 +76,7 @@ def _copy(pipeline: Pipeline, request: ClassifyRequest, layout: Layout) -> tuple
     beside = target if pipeline.copied else ".las"
     copy = copy_of(source, layout, beside, request.extra_dims, reader)
     wkt, note = text_of(reader)
-    columns = LasColumns(source, layout)
+    columns = LasColumns([(layout, source)])
     known = selection(request.where, columns)
     messages = [note, beyond_box(source, _box_of(columns))]
     messages += describe_selection(request.where, known)

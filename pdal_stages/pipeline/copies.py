@@ -183,7 +183,7 @@ def _ignored(reader: StageJson) -> set[str]:
 
 def named_types(layout: Layout) -> dict[str, str]:
     """Return the extra dimensions of a file with PDAL's names of their types."""
-    kinds = {name: layout.type_of(name).name for name in layout.extra_by_name}
+    kinds = {name: each.kind.name for name, each in layout.extra_by_name.items()}
     return {name: FLOATS.get(kind, kind) for name, kind in kinds.items()}
 
 

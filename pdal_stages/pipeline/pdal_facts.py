@@ -181,8 +181,8 @@ def check_inputs(stages: Sequence[StageJson]) -> None:
 
 def _compare_types(path: str, layout: Layout | None, types: dict[str, tuple[str, str]]) -> None:
     """Refuse an extra dimension of two types: PDAL takes the first for all values."""
-    for name in layout.extra_by_name if layout else ():
-        kind = layout.type_of(name).name  # type: ignore[union-attr]
+    for name, each in layout.extra_by_name.items() if layout else ():
+        kind = each.kind.name
         first, other = types.setdefault(name.lower(), (kind, path))
         if first != kind:
             raise PipelineError(
@@ -197,7 +197,7 @@ def overwritten_names(layout: Layout) -> list[str]:
 
     But for ClassFlags, the copy of the flags that PDAL before 2.3 itself writes with ``all``.
     """
-    own = {_plain(name) for name in layout.names if name not in layout.extra_by_name} | {
+    own = {_plain(name) for name in layout.fields if name not in layout.extra_by_name} | {
         "class",
         "cls",
     }

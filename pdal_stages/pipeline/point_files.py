@@ -28,9 +28,9 @@ def read_columns(
     """
     if can_read_chunks(path):
         layout = Layout.of_file(path)
-        names = [name for name in (*_ALWAYS, *wanted) if name in layout.names]
+        names = [name for name in (*_ALWAYS, *wanted) if name in layout.fields]
         for records in read_records(path, layout, only=names):
-            yield {name: layout.column(records, name) for name in names}, False
+            yield {name: layout.fields[name].read(records) for name in names}, False
         return
     run = pdal_env.execute([pdal_env.reader_of(path, "input")])
     for array in run.arrays:

@@ -148,7 +148,7 @@ def _correct(
     before = pair.before
     reference = reference_of_file(before)
     layout = Layout.of_file(before)
-    las = LasColumns(before, layout)
+    las = LasColumns([(layout, before)])
     xyz = np.column_stack([las[axis] for axis in "XYZ"])
     codes = las["Classification"]
     warnings: list[str] = []
@@ -169,7 +169,7 @@ def _correct(
             "nothing was changed, and no point lies in a checked area",
             found=", ".join(filter(None, (pair.after, *missed))),
         )
-    _write(layout, las, pair.output, new, checked, outputs)
+    _write(layout, las, pair, new, checked, outputs)
     return [*_describe(codes, new, checked), *warnings]
 
 
@@ -198,7 +198,7 @@ def _refuse_files(pairs: Sequence[_Pair], areas: Sequence[str]) -> None:
 def _write(
     layout: Layout,
     las: LasColumns,
-    output: str,
+    pair: _Pair,
     codes: NDArray[np.uint8],
     checked: NDArray[np.bool_],
     outputs: ExitStack,
@@ -214,15 +214,15 @@ def _write(
         try:  # of per cent, 1 would be next to nothing
             Points(arrays).reliability  # noqa: B018
         except StageError as error:
-            raise error.at(str(las.path)) from None
+            raise error.at(pair.before) from None
         values["Reliability"] = np.where(checked, 1.0, arrays["Reliability"])
         kinds["Reliability"] = "float"
-    copy = copy_of(las.path, layout, output, kinds, {})
+    copy = copy_of(pair.before, layout, pair.output, kinds, {})
 
     def check(partial: Path, final: Path, number: int) -> None:
         check_complete(partial, final, {"type": "writers.las"}, copy.count)
 
-    (part,) = outputs.enter_context(whole_files(output, check=check))
+    (part,) = outputs.enter_context(whole_files(pair.output, check=check))
     write_copy(copy, part, values)
 
 
@@ -235,9 +235,9 @@ def _edited_codes(
     warnings: list[str],
 ) -> NDArray[np.uint8]:
     """Return the classes of the same points in another file; their former ones where missing."""
-    other = LasColumns(after, Layout.of_file(after))
+    other = LasColumns([(Layout.of_file(after), after)])
     theirs = np.column_stack([other[axis] for axis in "XYZ"])
-    steps = np.maximum(las.layout.header.scales, other.layout.header.scales)
+    steps = np.max([each.parts[0][0].header.scales for each in (las, other)], axis=0)
     names = [name for name in _DISTINGUISHING if name in las and name in other]
     pairs = [(las[name], other[name]) for name in names]
     index = match_points(xyz, theirs, steps, pairs, max_steps=MAX_STEPS)

@@ -17,7 +17,7 @@ from ..base.columns import LazyColumns, SomeRows
 from ..base.errors import NoTerrainError, StageError
 from ..base.grid import GridWindow
 from ..base.las_check import beyond_box
-from ..base.las_points import USUAL, Layout, RecordColumns, read_records
+from ..base.las_points import USUAL, LasColumns, Layout, read_records
 from ..classifier.interface import PassInputs
 from ..classifier.model import OTHER_DENSITY
 from ..features.cell_means import density
@@ -51,7 +51,7 @@ def _is_in_its_box(path: str, layout: Layout) -> bool:
     Not all are read for that: a file whose box is wrong has mostly no point in it.
     """
     for records in read_records(path, layout, 0, min(_PROBED, layout.header.count), only=["X"]):
-        x, y = (layout.column(records, axis) for axis in "XY")
+        x, y = (layout.fields[axis].read(records) for axis in "XY")
         return beyond_box(path, (x.min(), y.min(), x.max(), y.max())) is None
     return True
 
@@ -74,15 +74,15 @@ class Surroundings(LazyColumns):
                 del self._layouts[index]
         first = []
         for index, layout in self._layouts.items():
-            names, rows, at = [n for n in layout.names if n in _READ], [np.zeros(0, np.int64)], 0
+            names, rows, at = [n for n in layout.fields if n in _READ], [np.zeros(0, np.int64)], 0
             for records in read_records(files[index], layout, only=names):
-                x, y = (layout.column(records, axis) for axis in "XY")
+                x, y = (layout.fields[axis].read(records) for axis in "XY")
                 inside = (x >= west) & (x <= east) & (y >= south) & (y <= north)
                 rows.append(at + np.flatnonzero(inside))
                 first.append((layout, records if inside.all() else records[inside]))
                 at += len(records)
             self._rows[index] = np.concatenate(rows)
-        self._first = RecordColumns(first)
+        self._first = LasColumns(first)
         self._more: dict[str, NDArray] = {}
         counts = [len(rows) for rows in self._rows.values()]
         #: (n,) each: number of the file, and of the point in it
@@ -106,7 +106,7 @@ class Surroundings(LazyColumns):
                     low, high = np.searchsorted(rows, (at, at + len(records)))
                     parts.append((layout, records[rows[low:high] - at]))
                     at += len(records)
-            self._more[name] = RecordColumns(parts)[name]
+            self._more[name] = LasColumns(parts)[name]
         return self._more[name]
 
     def nearest(self, place: AskedPlace, unit: float) -> tuple[int, float]:

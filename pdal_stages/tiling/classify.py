@@ -181,6 +181,6 @@ class ClassifyTask:
         for path in self.files:
             if layout := layout_there(path):
                 try:
-                    condition.check(layout.names)
+                    condition.check(layout.fields.keys())
                 except DimensionError as error:
                     raise error.at(path) from None

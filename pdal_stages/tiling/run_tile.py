@@ -34,7 +34,7 @@ from ..base.distinct import count_shared
 from ..base.errors import NoTerrainError, PipelineError
 from ..base.json_types import JsonObject, StageJson
 from ..base.las_copy import LasCopy
-from ..base.las_points import RecordColumns
+from ..base.las_points import LasColumns
 from ..base.messages import shorten
 from ..pipeline.copies import selection
 from ..pipeline.pdal_facts import check_class_codes
@@ -103,7 +103,7 @@ class _RoundRun:
         if plan.read_here:
             parts = [(piece.layout, piece.records) for piece in self.pieces]
             known = _concatenate_by_name(origins)
-            seen = pipeline.run_here(RecordColumns(parts), self.context.wkt, known, self._after)
+            seen = pipeline.run_here(LasColumns(parts), self.context.wkt, known, self._after)
             self._take({"spatialreference": {"wkt": self.context.wkt}}, seen, {})
         else:
             pipeline.execute(arrays=False)
@@ -190,7 +190,7 @@ class _RoundRun:
         stages = []
         for number, (piece, origin) in enumerate(zip(self.pieces, origins, strict=True)):
             path = os.path.join(self.folder, f"piece{number}.las")
-            added = {n: v.dtype for n, v in origin.items() if n not in piece.layout.names}
+            added = {n: v.dtype for n, v in origin.items() if n not in piece.layout.fields}
             copy = LasCopy(piece.source.path, piece.layout, False, added)
             with copy.writing_to(Path(path)):
                 copy.write(piece.records, origin)
@@ -274,7 +274,7 @@ def _with_origin(
 ) -> dict[str, NDArray]:
     """Return where a piece's points come from, and the dimensions that an earlier round changed."""
     count, layout = len(piece.index), piece.layout
-    columns = RecordColumns([(layout, piece.records)])
+    columns = LasColumns([(layout, piece.records)])
     origins: dict[str, NDArray] = {
         ROW: np.arange(count, dtype=np.uint32),
         INPUT: np.full(count, number, np.uint32),
@@ -473,7 +473,7 @@ def _describe(halo: _TileHalo, pieces: list[Piece], result: RoundResult) -> Tile
 def _shared(pieces: Sequence[Piece]) -> list[tuple[str, str, int]]:
     """Return the pairs of inputs that hold the same points in a tile, and how many."""
     parts = [(piece, piece.records[piece.own_rows]) for piece in pieces if len(piece.own_rows)]
-    columns = [RecordColumns([(piece.layout, records)]) for piece, records in parts]
+    columns = [LasColumns([(piece.layout, records)]) for piece, records in parts]
     paths = [piece.source.path for piece, _ in parts]
     return [(paths[a], paths[b], count) for (a, b), count in count_shared(columns).items()]
 

@@ -55,7 +55,7 @@ def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> 
     changed_ns, digest = os.stat(path).st_ctime_ns, digest_of_file(path)
     with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
         for records in read_records(path, layout, most=_PART):
-            x, y = layout.column(records, "X"), layout.column(records, "Y")
+            x, y = (layout.fields[axis].read(records) for axis in "XY")
             low = np.minimum(low, (x.min(), y.min()))
             high = np.maximum(high, (x.max(), y.max()))
             column, line = cells.index(x), cells.index(y)
@@ -107,7 +107,7 @@ def points_near(layout: Layout, index: CloudIndex, box: Box) -> tuple[NDArray[np
             file.seek(first * dtype.itemsize)
             parts.append(np.fromfile(file, dtype, count))
     rows = np.concatenate(parts)
-    x, y = layout.column(rows["record"], "X"), layout.column(rows["record"], "Y")
+    x, y = (layout.fields[axis].read(rows["record"]) for axis in "XY")
     rows = rows[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]
     rows = rows[np.argsort(rows["number"])]
     return np.ascontiguousarray(rows["number"]), np.ascontiguousarray(rows["record"])
@@ -152,7 +152,7 @@ def cut_all(
         numbers, records = points_near(layout, source.index, box)
         if not len(records):
             continue
-        x, y = layout.column(records, "X"), layout.column(records, "Y")
+        x, y = (layout.fields[axis].read(records) for axis in "XY")
         places = np.column_stack([grid.index(x), grid.index(y)])
         away = np.maximum(inner[0] - x, x - inner[2])
         away = np.maximum(away, np.maximum(inner[1] - y, y - inner[3]))

@@ -22,7 +22,7 @@ from ..base.errors import StageError
 from ..base.grid import GridWindow
 from ..base.hashing import fingerprint
 from ..base.json_types import JsonObject
-from ..base.las_points import RecordColumns
+from ..base.las_points import LasColumns
 from ..base.messages import count_of, print_messages
 from ..base.version import build
 from .inputs import LONE_M, InputSource, LonePoints, Survey
@@ -239,8 +239,8 @@ def points_of_tile(grid: TileGrid, tile: Tile, sources: Sequence[InputSource]) -
         assert source.index is not None
         layout = source.layout
         records = points_near(layout, source.index, grid.box(tile))[1]
-        x, y = layout.column(records, "X"), layout.column(records, "Y")
+        x, y = (layout.fields[axis].read(records) for axis in "XY")
         inside = (grid.index(x) == tile[0]) & (grid.index(y) == tile[1])
         if inside.any():
-            parts.append((source.path, RecordColumns([(layout, records[inside])])))
+            parts.append((source.path, LasColumns([(layout, records[inside])])))
     return parts

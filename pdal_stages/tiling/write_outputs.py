@@ -191,7 +191,7 @@ def _copy(
     added = dict(plan.makes if plan.extra_dims is None else plan.extra_dims)
     if plan.creates is None:  # PDAL's filters may have made others, in between
         named = {name: FLOATS.get(kind.name, f"{kind.name}_t") for name, kind in types.items()}
-        added = {name: kind for name, kind in named.items() if name not in layout.names} | added
+        added = {name: kind for name, kind in named.items() if name not in layout.fields} | added
     added.pop("Classification", None)
     return copy_of(source.path, layout, target, added, source.reader)
 

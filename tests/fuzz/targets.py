@@ -150,7 +150,7 @@ def cloud(data: bytes) -> str:
     path = put("cloud.laz", data)
     las_check.check_readable(path)
     las.projection_digest(path)
-    assert Layout.of_file(path).names
+    assert Layout.of_file(path).fields
     extent = inputs.las_extent(str(path))
     assert (
         sort_points(str(path), TileGrid(10.0), TileGrid(250.0), str(path.with_suffix(".copy")))[
