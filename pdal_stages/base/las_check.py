@@ -47,9 +47,6 @@ _MOST_CHUNKS = 200_000
 #: Most points of a chunk, since lazrs allocates memory for all of them; 50,000 are usual.
 _LARGEST_CHUNK = 2**24
 
-#: A problem, and the value that shows it.
-Problem = tuple[str, str]
-
 
 def check_readable(path: str | os.PathLike) -> str | None:
     """Refuse a LAS or LAZ file whose header cannot be right; return a warning if it is unusual.
@@ -65,23 +62,15 @@ def check_readable(path: str | os.PathLike) -> str | None:
         if header is None:
             value = f"{size:,} bytes without a LAS header"
             raise StageError("not a LAS file", found=value, cure=CURE_OF_DAMAGE)
+        _check_header(header, size)
         with open(path, "rb") as file:
-            problem = _header_problem(header, size) or _record_problem(file, header, size)
-            check = _chunk_problem if header.compressed else _count_problem
-            problem = problem or check(file, header, size)
-        if not problem:
-            Layout.of_file(path)  # whose extra bytes must fit
+            _check_records(file, header, size)
+            (_check_chunks if header.compressed else _check_count)(file, header, size)
+        Layout.of_file(path)  # whose extra bytes must fit
     except OSError as error:
         raise StageError("the file cannot be read", where=where, found=error) from None
     except StageError as error:
         raise error.at(where) from None
-    if problem:
-        raise StageError(
-            f"the LAS file is damaged: {problem[0]}",
-            where=where,
-            found=problem[1],
-            cure=CURE_OF_DAMAGE,
-        )
     warning = _describe_oddity(header, size)
     return warning and f"{path}: {warning}"
 
@@ -177,134 +166,133 @@ def _is_whole(path: Path, count: int | None) -> bool:
     return header is not None and count in (None, header.count)
 
 
-def _header_problem(header: LasHeader, size: int) -> Problem | None:
-    """Return a problem of the header itself."""
-    h = header
-    if h.minor > 5:
-        return "its version is not known", f"LAS 1.{h.minor}"
-    if h.point_format >= len(POINT_BYTES):
-        return "its point format is not known", f"point format {h.point_format}"
-    least, header_least = POINT_BYTES[h.point_format], _HEADER_BYTES[h.minor]
+def _require(good: bool, what: str, found: str) -> None:
+    """Refuse a file as damaged unless a condition holds."""
+    if not good:
+        raise StageError(f"the LAS file is damaged: {what}", found=found, cure=CURE_OF_DAMAGE)
+
+
+def _check_header(header: LasHeader, size: int) -> None:
+    """Refuse a header that cannot be right."""
+    h, kind = header, header.point_format
+    _require(h.minor <= 5, "its version is not known", f"LAS 1.{h.minor}")
+    _require(kind < len(POINT_BYTES), "its point format is not known", f"point format {kind}")
+    found = f"{h.point_bytes} bytes, format {kind} has {POINT_BYTES[kind]}"
+    _require(h.extra_bytes >= 0, "its points are shorter than their format", found)
+    least = _HEADER_BYTES[h.minor]
+    found = f"{h.header_bytes} bytes, LAS 1.{h.minor} has {least}"
+    _require(h.header_bytes >= least, "its header is too short", found)
+    found = f"header of {h.header_bytes} bytes, points at {h.offset}"
+    _require(h.header_bytes <= min(h.offset, size), "its points begin inside the header", found)
+    fit, found = (
+        h.records * 54 <= h.offset - h.header_bytes,
+        f"{h.records:,} records before the points",
+    )
+    _require(fit, "it counts more records than there is room for", found)
     finite = all(_SMALLEST_SCALE <= abs(value) < math.inf for value in h.scales)
     finite &= all(abs(value) <= _LARGEST_OFFSET for value in h.offsets)
-    checks = (
-        (h.point_bytes >= least, "its points are shorter than their format",
-         f"{h.point_bytes} bytes, format {h.point_format} has {least}"),
-        (h.header_bytes >= header_least, "its header is too short",
-         f"{h.header_bytes} bytes, LAS 1.{h.minor} has {header_least}"),
-        (h.header_bytes <= min(h.offset, size), "its points begin inside the header",
-         f"header of {h.header_bytes} bytes, points at {h.offset}"),
-        (h.records * 54 <= h.offset - h.header_bytes,
-         "it counts more records than there is room for",
-         f"{h.records:,} records before the points"),
-        (finite, "its scales or offsets are not valid numbers",
-         f"scales {h.scales}, offsets {h.offsets}"),
-        (not h.count or h.offset <= size, "it is cut short",
-         f"{size:,} bytes, points begin at {h.offset:,}"),
-    )  # fmt: skip
-    return next(((what, value) for good, what, value in checks if not good), None)
+    found = f"scales {h.scales}, offsets {h.offsets}"
+    _require(finite, "its scales or offsets are not valid numbers", found)
+    found = f"{size:,} bytes, points begin at {h.offset:,}"
+    _require(not h.count or h.offset <= size, "it is cut short", found)
 
 
-def _record_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | None:
-    """Return a problem of the records after the points."""
+def _check_records(file: BinaryIO, header: LasHeader, size: int) -> None:
+    """Refuse records after the points that are not there."""
     count = header.records_after
-    points = 0 if header.compressed else header.count * header.point_bytes
-    if not count or header.offset + points > size:
-        return None
-    if not header.offset + points <= header.after <= size - 60 * count:
-        value = f"{count:,} records at {header.after:,}, a file of {size:,} bytes"
-        return "the records after its points are not where it says", value
+    end = header.offset + (0 if header.compressed else header.count * header.point_bytes)
+    if not count or end > size:  # of which the number of points tells
+        return
+    found = f"{count:,} records at {header.after:,}, a file of {size:,} bytes"
+    there = end <= header.after <= size - 60 * count
+    _require(there, "the records after its points are not where it says", found)
     whole = sum(r.after and r.data + r.length <= size for r in records(file, header))
-    if whole < count:
-        value = f"{whole:,} of {count:,} do"
-        return "the records after its points do not end within the file", value
-    return None
+    what = "the records after its points do not end within the file"
+    _require(whole == count, what, f"{whole:,} of {count:,} do")
 
 
-def _count_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | None:
-    """Return a problem of the number of uncompressed points."""
+def _check_count(file: BinaryIO, header: LasHeader, size: int) -> None:
+    """Refuse a wrong number of uncompressed points."""
     held = max(0, end_of_points(header, size) - header.offset) // header.point_bytes
-    if held < header.count:
-        return "it is cut short", f"{held:,} whole points, its header counts {header.count:,}"
-    return _uncounted(held * header.point_bytes) if held and not header.count else None
+    found = f"{held:,} whole points, its header counts {header.count:,}"
+    _require(held >= header.count, "it is cut short", found)
+    _require_counted(header, held * header.point_bytes)
 
 
-def _uncounted(size: int) -> Problem:
-    """Return the problem of a file of points whose header counts none."""
-    return (
+def _require_counted(header: LasHeader, size: int) -> None:
+    """Refuse a file of `size` bytes of points whose header counts none."""
+    what = (
         "its header counts no points, but the file holds some, as when a program was stopped "
-        "before it finished",
-        f"{size:,} bytes where points are",
+        "before it finished"
     )
+    _require(header.count > 0 or size <= 0, what, f"{size:,} bytes where points are")
 
 
-def _chunk_problem(file: BinaryIO, header: LasHeader, size: int) -> Problem | None:
-    """Return a problem of the chunks of a LAZ file and their table, which is written last.
+def _check_chunks(file: BinaryIO, header: LasHeader, size: int) -> None:
+    """Refuse chunks of a LAZ file that do not agree with their table, which is written last.
 
     Layout: "LAZ specification 1.4", chunk table.
     """
     coding = laszip_record(file, header)
     if header.count and coding.startswith(POINTWISE):  # only decoding all points would tell
-        return None
+        return
     (_, table), begin = chunk_table(file, header), header.offset + 8
     inside = begin <= table <= size - 8
     if not header.count:  # an empty file may have 8 bytes
         end = table - 8 if inside else end_of_points(header, size)
-        return _uncounted(end - begin) if end > begin else None
-    if not inside:
-        return "it is cut short", f"{size:,} bytes, its table of chunks should be at {table:,}"
-    if len(coding) < 16:
-        return "it has no record of how it is compressed", "no 'laszip encoded' among its records"
-    return _table_problem(file, header, table, int.from_bytes(coding[12:16], "little"))
+        return _require_counted(header, end - begin)
+    found = f"{size:,} bytes, its table of chunks should be at {table:,}"
+    _require(inside, "it is cut short", found)
+    what = "it has no record of how it is compressed"
+    _require(len(coding) >= 16, what, "no 'laszip encoded' among its records")
+    _check_table(file, header, table, int.from_bytes(coding[12:16], "little"))
 
 
-def _table_problem(
-    file: BinaryIO, header: LasHeader, table: int, chunk_points: int
-) -> Problem | None:
-    """Return a problem of the table of chunks at `table`, each of `chunk_points`."""
+def _check_table(file: BinaryIO, header: LasHeader, table: int, chunk_points: int) -> None:
+    """Refuse a table of chunks at `table`, each of `chunk_points`, that is not that of the file."""
     file.seek(table)
     head = file.read(8)
     version, number = struct.unpack("<II", head)
     varies = chunk_points in (0, 2**32 - 1)
     room = table - header.offset - 8
-    if version:
-        return "its table of chunks is of an unknown version", str(version)
-    if not varies and chunk_points > _LARGEST_CHUNK:
-        return "its chunks are larger than any program makes them", f"{chunk_points:,} points"
-    if number * header.point_bytes > room:  # a chunk begins with a whole point
-        return "it has more chunks than there is room for", f"{number:,} chunks in {room:,} bytes"
+    _require(not version, "its table of chunks is of an unknown version", str(version))
+    what, found = "its chunks are larger than any program makes them", f"{chunk_points:,} points"
+    _require(varies or chunk_points <= _LARGEST_CHUNK, what, found)
+    what, found = (
+        "it has more chunks than there is room for",
+        f"{number:,} chunks in {room:,} bytes",
+    )
+    _require(number * header.point_bytes <= room, what, found)  # a chunk begins with a whole point
     if number > _MOST_CHUNKS:
-        return None
-    try:
-        sizes, counts = _decode_table(head + file.read(56 + 16 * number), varies)
-    except EOFError:
-        return "it is cut short", f"its table of {number:,} chunks does not end"
-    if sum(sizes) != room:
-        value = f"{sum(sizes):,} bytes in chunks, {room:,} bytes there"
-        return "its chunks do not fill the file", value
+        return
+    sizes, counts = _decode_table(head + file.read(56 + 16 * number), varies)
+    _require(
+        bool(sizes) or not number, "it is cut short", f"its table of {number:,} chunks does not end"
+    )
+    found = f"{sum(sizes):,} bytes in chunks, {room:,} bytes there"
+    _require(sum(sizes) == room, "its chunks do not fill the file", found)
     held = sum(counts) if varies else number * chunk_points
     # Chunks of formats 6 and later begin with a point and their number of points.
     if not varies and header.point_format >= 6 and number:
         file.seek(table - sizes[-1] + header.point_bytes)
         held += int.from_bytes(file.read(4), "little") - chunk_points
     exact = varies or header.point_format >= 6
-    if held < header.count or (exact and held > header.count):
-        value = f"{header.count:,} counted, {held:,} held"
-        return "its header counts a different number of points than it holds", value
-    return None
+    good = held == header.count or (held > header.count and not exact)
+    what = "its header counts a different number of points than it holds"
+    _require(good, what, f"{header.count:,} counted, {held:,} held")
 
 
 def _decode_table(table: bytes, varies: bool) -> tuple[list[int], list[int]]:
-    """Return the bytes of each chunk, and its points if they vary; EOFError for a cut table."""
+    """Return the bytes of each chunk, and its points if they vary; none of a table cut short."""
     import lazrs
 
     if any(table[4:8]) and table[8:12] == b"\xff" * 4:  # no encoder writes it, and lazrs panics
-        raise EOFError
+        return [], []
     try:
         coding = lazrs.LazVlr.new_for_compression(0, 0, varies)
         entries = lazrs.read_chunk_table_only(io.BytesIO(table), coding)
     except lazrs.LazrsError:
-        raise EOFError from None
+        return [], []
     # The numbers have 32 bits; lazrs takes the upper half of them for negative ones.
     sizes = [size % 2**32 for _, size in entries]
     return sizes, [points % 2**32 for points, _ in entries] if varies else []
