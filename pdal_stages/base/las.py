@@ -23,14 +23,16 @@ from .errors import StageError
 #: Bytes of a point of each format, without extra bytes (LAS 1.4 R15, tables 7 to 18). A format that
 #: is not here is refused; PDAL and laspy must read it as well.
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
-#: Point formats with waveforms, and the same formats without.
-WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
+#: Point formats with waveforms.
+WAVES = (4, 5, 9, 10)
 
 
 @dataclass(frozen=True)
 class LasHeader:
     """The fields of a header that the layout of the file follows from."""
 
+    source_id: int  #: of the file; LAS 1.0 has none
+    says_wkt: bool  #: whether its spatial reference is well-known text
     minor: int
     point_format: int
     point_bytes: int
@@ -84,8 +86,10 @@ def read_header(path: str | os.PathLike) -> LasHeader | None:
         place, after, count = struct.unpack_from("<QIQ", head, 235)
     numbers = struct.unpack_from("<12d", head, 131)
     x1, x0, y1, y0 = numbers[6:10]
+    source, flags = struct.unpack_from("<HH", head, 4)
     return LasHeader(
-        minor, kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, place, count,
+        source if minor else 0, bool(flags & 16), minor,
+        kind & 0x3F, length, bool(kind & 0xC0), size, offset, records, after, place, count,
         waveforms, any(numbers[6:]), numbers[:3], numbers[3:6], (x0, y0, x1, y1),
     )  # fmt: skip
 
@@ -99,13 +103,6 @@ def header_there(path: str | os.PathLike) -> LasHeader | None:
         return read_header(path)
     except (OSError, ValueError):
         return None
-
-
-def source_id(path: str | os.PathLike) -> int:
-    """Return the file source id of a LAS file, which LAS 1.0 has not."""
-    with open(path, "rb") as file:
-        head = file.read(26)
-    return int.from_bytes(head[4:6], "little") if head[25:] > b"\0" else 0
 
 
 def end_of_points(header: LasHeader, size: int) -> int:
@@ -174,13 +171,12 @@ def records_of(path: str | os.PathLike, user: bytes) -> Iterator[tuple[Record, b
                 yield record, file.read(record.length)
 
 
-def laszip_record(file: BinaryIO, header: LasHeader) -> bytes:
+def laszip_record(path: str | os.PathLike) -> bytes:
     """Return the record of how a LAZ file is compressed; empty where it has none."""
-    for record in records(file, header):
-        if (record.user, record.number) == (b"laszip encoded", 22204):
-            file.seek(record.data)
-            return file.read(min(record.length, LARGEST_RECORD))
-    return b""
+    coding = (
+        data for record, data in records_of(path, b"laszip encoded") if record.number == 22204
+    )
+    return next(coding, b"")
 
 
 def chunk_table(file: BinaryIO, header: LasHeader) -> tuple[int, int]:
@@ -221,13 +217,6 @@ def supersede_copc(path: str | os.PathLike) -> None:
 PROJECTION = b"LASF_Projection"
 
 
-def says_wkt(path: str | os.PathLike) -> bool:
-    """Return whether the header of a LAS file says that its reference is well-known text."""
-    with open(path, "rb") as file:
-        head = file.read(8)
-    return bool(head[6:7] and head[6] & 16)
-
-
 def projection_digest(path: str | os.PathLike) -> str:
     """Return a digest of the records that hold a file's spatial reference; empty without any.
 
@@ -236,12 +225,21 @@ def projection_digest(path: str | os.PathLike) -> str:
     OSError
         If the file cannot be read.
     """
-    held = records_of(path, PROJECTION)
+    held, header = records_of(path, PROJECTION), read_header(path)
     parts = [struct.pack("<HQ", record.number, record.length) + data for record, data in held]
-    flag = bytes([says_wkt(path)])
+    flag = bytes([header is not None and header.says_wkt])
     return hashlib.sha256(flag + b"".join(parts)).hexdigest()[:16] if parts else ""
+
+
+#: PDAL's names of types that are not NumPy's.
+_FLOATS = {"double": "float64", "float": "float32"}
 
 
 def number_type(kind: str) -> np.dtype:
     """Return the NumPy type of a PDAL type: ``double``, ``float``, ``uint8`` or ``uint8_t``."""
-    return np.dtype({"float": "f4", "double": "f8"}.get(kind, kind.removesuffix("_t")))
+    return np.dtype(_FLOATS.get(kind, kind.removesuffix("_t")))
+
+
+def pdal_type(kind: np.dtype) -> str:
+    """Return PDAL's name of a NumPy type."""
+    return next((name for name, plain in _FLOATS.items() if plain == kind.name), kind.name)

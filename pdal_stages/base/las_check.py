@@ -233,7 +233,7 @@ def _check_chunks(file: BinaryIO, header: LasHeader, size: int) -> None:
 
     Layout: "LAZ specification 1.4", chunk table.
     """
-    coding = laszip_record(file, header)
+    coding = laszip_record(file.name)
     if header.count and coding.startswith(POINTWISE):  # only decoding all points would tell
         return
     (_, table), begin = chunk_table(file, header), header.offset + 8

@@ -86,7 +86,7 @@ class LasCopy:
         self.point_bytes = header.point_bytes
         for name in (name for name in added if name not in self.replaced):
             kind = np.dtype(added[name]).newbyteorder("<")
-            self.fields[name] = Field(name, self.point_bytes, kind, kind, "")
+            self.fields[name] = Field(name, self.point_bytes, kind, "")
             self.added.append(name)
             self.point_bytes += kind.itemsize
         self.compressed = compressed

@@ -33,13 +33,6 @@ ENTRY = 192
 MOST_ENTRIES = 65_535 // ENTRY
 #: Types of extra bytes 1 to 10; 11 to 20 are pairs, 21 to 30 triples of these.
 TYPES = tuple(map(np.dtype, ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")))
-#: Bit of a description's options: there is a scale.
-_SCALED = 8
-#: Bit of a description's options: there is an offset.
-_SHIFTED = 16
-#: Bytes at which a description has its scales and its offsets.
-_NUMBERS = (112, 136)
-
 _COORDINATES = [("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("Intensity", "<u2"), ("returns", "u1")]
 #: Fields of a point of formats 0 to 5, and of 6 to 10, in their order.
 _OLD = [*_COORDINATES, ("class", "u1"), ("ScanAngleRank", "i1"), ("UserData", "u1"),
@@ -96,12 +89,18 @@ class Field(NamedTuple):
     name: str  #: an element of an array of extra bytes has its number behind it
     at: int  #: byte of the record at which it begins
     type: np.dtype  #: of the bytes
-    kind: np.dtype  #: of the values
     layer: str  #: what lazrs must decode of LAZ 1.4; empty for what it always does
     scale: float | None = None  #: None where the number is the value
     shift: float = 0.0
     low: int = 0  #: the lowest bit
     bits: int = 0  #: number of bits; 0 for whole bytes
+
+    @property
+    def kind(self) -> np.dtype:
+        """Return the type of the values."""
+        if self.scale is None:
+            return self.type.newbyteorder("=")
+        return np.dtype(np.float32 if self.name == "ScanAngleRank" else float)
 
     def numbers(self, records: NDArray) -> NDArray:
         """Return the numbers (n,) that records (n,) hold, as a view of their bytes."""
@@ -166,18 +165,18 @@ def extra_fields(header: LasHeader, data: bytes) -> list[Field]:
     """
     fields, at = [], header.point_bytes - header.extra_bytes
     for entry in entries_of(data):
-        count, name = (entry[2] - 1) // 10 + 1, decode_text(entry[4:36])
-        size = size_of_entry(entry)
-        for n in range(count if entry[2] else 0):
-            kind = TYPES[(entry[2] - 1) % 10]
-            scale, shift = (struct.unpack_from("<d", entry, byte + 8 * n)[0] for byte in _NUMBERS)
-            scale = scale if entry[3] & _SCALED else 1.0
-            shift = shift if entry[3] & _SHIFTED else 0.0
-            plain = scale == 1.0 and shift == 0.0
+        options, name = entry[3], decode_text(entry[4:36])
+        kind, size = TYPES[(entry[2] - 1) % 10], size_of_entry(entry)
+        count = size // kind.itemsize if entry[2] else 0
+        numbers = struct.unpack_from("<6d", entry, 112)  # three scales, three offsets
+        for n in range(count):
+            scale, shift = (
+                numbers[n] if options & 8 else 1.0,
+                numbers[3 + n] if options & 16 else 0.0,
+            )
             title, begin = name if count == 1 else f"{name}{n}", at + n * kind.itemsize
-            values = kind.newbyteorder("=") if plain else np.dtype(float)
-            layer = _LAYERS["extra"]
-            fields.append(Field(title, begin, kind, values, layer, None if plain else scale, shift))
+            scaling = () if (scale, shift) == (1.0, 0.0) else (scale, shift)
+            fields.append(Field(title, begin, kind, _LAYERS["extra"], *scaling))
         at += size
     if at > header.point_bytes:
         room = header.extra_bytes
@@ -241,22 +240,19 @@ class Layout:
     @cached_property
     def fields(self) -> dict[str, Field]:
         """Return all dimensions by name; extra bytes named like one of the format are none."""
-        header, double = self.header, np.dtype(float)
+        header = self.header
         listed = np.dtype((_OLD if self.is_old else _NEW) + _MORE[header.point_format])
-        axes = zip(AXES, header.scales, header.offsets, strict=True)
-        scales: dict[str, tuple[np.dtype, float | None, float]]
-        scales = {axis: (double, scale, shift) for axis, scale, shift in axes}
-        step = 1.0 if self.is_old else _ANGLE_STEP
-        scales["ScanAngleRank"] = np.dtype(np.float32), step, 0.0
-        parts: dict[str, Field] = {}
-        for name, (kind, at, *_) in (listed.fields or {}).items():
-            values, scale, shift = scales.get(name, (kind.newbyteorder("="), None, 0.0))
-            parts[name] = Field(name, at, kind, values, _LAYERS.get(name, ""), scale, shift)
+        axes = zip(header.scales, header.offsets, strict=True)
+        scales = dict(zip(AXES, axes, strict=True))
+        scales["ScanAngleRank"] = 1.0 if self.is_old else _ANGLE_STEP, 0.0
+        parts = {
+            name: Field(name, at, kind, _LAYERS.get(name, ""), *scales.get(name, ()))
+            for name, (kind, at, *_) in (listed.fields or {}).items()
+        }
         fields = {name: part for name, part in parts.items() if name[0].isupper()}
         for name, (part, low, bits) in (_OLD_BITS if self.is_old else _NEW_BITS).items():
             fields[name] = parts[part]._replace(name=name, low=low, bits=bits)
-        extra = {each.name: each for each in self.extra if each.name not in {"", *fields}}
-        return fields | extra
+        return fields | {each.name: each for each in self.extra if each.name not in {"", *fields}}
 
     @cached_property
     def extra_by_name(self) -> dict[str, Field]:
@@ -341,7 +337,7 @@ def _parts(
         return
     import lazrs
 
-    coding = laszip_record(file, header)
+    coding = laszip_record(file.name)
     layers = {layout.fields[name].layer for name in only or () if name in layout.fields}
     layers = {"ALL"} if only is None else {"XY_RETURNS_CHANNEL", *layers} - {""}
     bits = [getattr(lazrs, f"SELECTIVE_DECOMPRESS_{layer}") for layer in layers]

@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.json_types import StageJson
-from ..base.las import named_copc, number_type
+from ..base.las import named_copc, number_type, pdal_type
 from ..base.las_copy import LasCopy
 from ..base.las_points import PART, Layout, describe, read_records
 from ..base.messages import shorten
@@ -38,8 +37,9 @@ def read_here(stages: Sequence[StageJson]) -> bool:
     for stage in stages:
         kind, names = stage["type"], stage.get("filename")
         if kind.startswith("readers."):
+            listed = names if isinstance(names, list) else [names]
             plain = kind in LAS_READERS and stage.keys() <= _READER
-            if not (plain and all(is_las(str(name)) for name in _as_list(names))):
+            if not (plain and all(is_las(str(name)) for name in listed)):
                 return False
         elif kind.startswith("filters.") and kind not in (*stage_types(), "filters.merge"):
             return False
@@ -54,10 +54,6 @@ def written_here(stages: Sequence[StageJson]) -> bool:
     name = str(writers[0]["filename"])
     named = is_las(name) or Path(name).name == "#"  # which takes the name of the input
     return named and not named_copc(name) and writers[0].get("forward") == "all"
-
-
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
 
 
 def run_stages(
@@ -136,10 +132,6 @@ def write_copy(copy: LasCopy, target: Path, values: Mapping[str, NDArray]) -> No
             at = end
 
 
-#: PDAL's names of types that are not NumPy's.
-FLOATS = {"float64": "double", "float32": "float"}
-
-
 #: The first version of PDAL whose option ``extra_dims`` counts before a record.
 _OPTION_FIRST = (2, 9, 0)
 
@@ -183,8 +175,7 @@ def _ignored(reader: StageJson) -> set[str]:
 
 def named_types(layout: Layout) -> dict[str, str]:
     """Return the extra dimensions of a file with PDAL's names of their types."""
-    kinds = {name: each.kind.name for name, each in layout.extra_by_name.items()}
-    return {name: FLOATS.get(kind, kind) for name, kind in kinds.items()}
+    return {name: pdal_type(each.kind) for name, each in layout.extra_by_name.items()}
 
 
 def extra_dims_option(layout: Layout | None, added: Mapping[str, str]) -> str:

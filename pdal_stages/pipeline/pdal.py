@@ -23,7 +23,7 @@ from typing import Any
 
 from ..base.errors import DependencyError, PipelineError
 from ..base.json_types import JsonObject, StageJson
-from ..base.las import named_copc, named_las, source_id
+from ..base.las import header_there, named_copc, named_las
 from ..base.las_check import check_readable
 from .inputs_outputs import readers_files
 from .interrupts import runs_pdal
@@ -272,7 +272,8 @@ def _file_source(writer: StageJson, before: list[StageJson]) -> int:
     """Return the file source id that a writer forwards; 0 where inputs differ or are LAS 1.0."""
     forward = str(writer.get("forward", ""))
     forwards = any(word in forward for word in ("all", "header", "filesource_id"))
-    ids = {source_id(path) for path in readers_files(before, las=True)} if forwards else set()
+    headers = map(header_there, readers_files(before, las=True)) if forwards else ()
+    ids = {header.source_id for header in headers if header}
     return ids.pop() if len(ids) == 1 else 0
 
 

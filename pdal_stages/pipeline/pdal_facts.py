@@ -16,7 +16,6 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.errors import DimensionError, OptionError, PipelineError, StageError
 from ..base.json_types import StageJson
 from ..base.las import (
-    POINT_BYTES,
     WAVES,
     LasHeader,
     header_there,
@@ -40,113 +39,104 @@ from .pdal_errors import FLAGS_CURE, FLAGS_IN_CLASSES
 from .runtime import ExpandedStage
 from .spatial_reference import MOVING, projection_records, reference_of
 
-CURE = "Run it with pdal-stages classify, which reads and copies LAS files without PDAL"
 _AS_LAS_14 = '"minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with near infrared)'
-#: Later than every version of PDAL.
-_ALWAYS = (10_000, 0, 0)
+
+
+def _unread_keys(path: str, header: LasHeader) -> str:
+    numbers = [number for number, data in projection_records(path) if len(data) >= 8]
+    return f"{path}, LAS 1.{header.minor}" if header.minor >= 4 and 34735 in numbers else ""
+
+
+def _waveforms(path: str, header: LasHeader) -> str:
+    found = f"{path}, point format {header.point_format}"
+    return found if header.point_format in WAVES else ""
+
+
+def _overwritten(path: str, header: LasHeader) -> str:
+    return ", ".join(overwritten_names(Layout.of_file(path)))
+
+
+def _odd_text(path: str, header: LasHeader) -> str:
+    with open(path, "rb") as file:
+        texts = [file.read(90)[26:90], *(part for r in records(file, header) for part in r[1:4:2])]
+    wrong = next((text for text in texts if text.decode(errors="ignore").encode() != text), b"")
+    return repr(wrong.rstrip(b"\0"))[1:] if wrong else ""
+
+
+def _undescribed(path: str, header: LasHeader) -> str:
+    data = [data for r, data in records_of(path, b"LASF_Spec") if r.number == 4]
+    named = sum(size_of_entry(each) for each in entries_of(data[0]) if each[2]) if data else 0
+    room = header.extra_bytes - named
+    return f"{room:,} bytes of a point" if room > 0 else ""
+
+
+def _runs_python(stages: Sequence[StageJson]) -> bool:
+    return any(stage["type"] in ("filters.python", *stage_types()) for stage in stages)
+
+
+def _writes_extra(stages: Sequence[StageJson]) -> bool:
+    return any(writes_las(stage) and "extra_dims" in stage for stage in stages)
 
 
 class Fact(NamedTuple):
     """Something that PDAL gets wrong of a file."""
 
-    until: tuple[int, int, int]  #: the first version that does not
     what: str
-    #: Takes a file's path, header and reader; returns the value that shows the fault, and an empty
-    #: text where the file does not have it.
-    shows: Callable[[str, LasHeader, StageJson], str]
-    cure: str = CURE
+    #: Takes a file's path and header; returns the value that shows the fault, and an empty text
+    #: where the file does not have it.
+    shows: Callable[[str, LasHeader], str]
+    cure: str
+    until: tuple[int, int, int] | None = None  #: the first version that does not; None: all do
+    unless: Collection[str] = ()  #: options of the reader with which it does not
+    #: Takes all stages of the pipeline; returns whether it matters to them.
+    matters: Callable[[Sequence[StageJson]], bool] = bool
 
 
-def _pattern(path: str, header: LasHeader, reader: StageJson) -> str:
-    return path if glob.has_magic(path) else ""
-
-
-def _unread_keys(path: str, header: LasHeader, reader: StageJson) -> str:
-    if header.minor < 4 or reader.keys() & {"override_srs", "default_srs", "spatialreference"}:
-        return ""
-    numbers = [number for number, data in projection_records(path) if len(data) >= 8]
-    return f"{path}, LAS 1.{header.minor}" if 34735 in numbers else ""
-
-
-def _waveforms(path: str, header: LasHeader, reader: StageJson) -> str:
-    found = f"{path}, point format {header.point_format}"
-    return found if header.point_format in WAVES else ""
-
-
-def _overwritten(path: str, header: LasHeader, reader: StageJson) -> str:
-    if reader.keys() & {"extra_dims", "ignore_vlr"}:
-        return ""
-    return ", ".join(overwritten_names(Layout.of_file(path)))
-
-
-def _odd_text(path: str, header: LasHeader, reader: StageJson) -> str:
-    with open(path, "rb") as file:
-        texts = [file.read(90)[26:90], *(part for r in records(file, header) for part in r[1:4:2])]
-    wrong = next((text for text in texts if not _is_utf8(text)), b"")
-    return repr(wrong.rstrip(b"\0"))[1:] if wrong else ""
-
-
-def _is_utf8(text: bytes) -> bool:
-    try:
-        text.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
-
-
-def _undescribed(path: str, header: LasHeader, reader: StageJson) -> str:
-    if reader.keys() & {"extra_dims", "ignore_vlr"}:
-        return ""
-    data = [data for r, data in records_of(path, b"LASF_Spec") if r.number == 4]
-    room = header.point_bytes - POINT_BYTES[header.point_format]
-    named = sum(size_of_entry(each) for each in entries_of(data[0]) if each[2]) if data else 0
-    return f"{room - named:,} bytes of a point" if room > named else ""
-
-
-#: What filters.python does not take.
-_NO_TEXT = Fact(
-    _ALWAYS,
-    "filters.python, in which the stages run, takes only texts in UTF-8 from a LAS file",
-    _odd_text,
-    "Write the file anew without it, or run it with pdal-stages classify, which keeps it",
-)
-#: What PDAL leaves out of a LAS file that is to hold all extra dimensions.
-_LEFT_OUT = Fact(
-    _ALWAYS,
-    "PDAL leaves out extra bytes that the first record of their descriptions does not name",
-    _undescribed,
-    'Name them: "extra_dims": "Name=type,..." of the reader, or leave "extra_dims" of the writer '
-    "out to drop all; or run it with pdal-stages classify, which keeps them",
-)
+_NAMES_EXTRA = ("extra_dims", "ignore_vlr")
 #: Facts of inputs, in the order in which they are looked for.
 FACTS = (
     Fact(
-        _ALWAYS,
         "PDAL takes the name of this file for a pattern, and reads others",
-        _pattern,
+        lambda path, _: path if glob.has_magic(path) else "",
         "Rename it, or run it with pdal-stages classify, which takes names as they are",
     ),
     Fact(
-        _ALWAYS,
         "PDAL does not read points with waveforms",
-        _waveforms,
+        lambda path, at: (
+            f"{path}, point format {at.point_format}" if at.point_format in WAVES else ""
+        ),
         "Convert the file to the format without them: laspy.convert(laspy.read(IN), "
         "point_format_id=N).write(OUT) with N 1 for 4, 3 for 5, 6 for 9, 8 for 10; or run it with "
         "pdal-stages classify, which keeps them",
     ),
     Fact(
-        (2, 4, 0),
         "this PDAL reads no spatial reference of LAS 1.4 with GeoTIFF keys",
         _unread_keys,
         'Name it: "default_srs": "EPSG:CODE" of the reader (--readers.las.default_srs); or run it '
         "with pdal-stages classify, which reads them",
+        until=(2, 4, 0),
+        unless=("override_srs", "default_srs", "spatialreference"),
     ),
     Fact(
-        _ALWAYS,
         "extra bytes are named like dimensions of LAS, so PDAL would overwrite these",
         _overwritten,
         'Read them under other names: readers.las with "ignore_vlr": "LASF_Spec/4" and '
         '"extra_dims": "Name=type,..."; or run it with pdal-stages classify, which keeps both',
+        unless=_NAMES_EXTRA,
+    ),
+    Fact(
+        "PDAL leaves out extra bytes that the first record of their descriptions does not name",
+        _undescribed,
+        'Name them: "extra_dims": "Name=type,..." of the reader, or leave "extra_dims" of the '
+        "writer out to drop all; or run it with pdal-stages classify, which keeps them",
+        unless=_NAMES_EXTRA,
+        matters=_writes_extra,
+    ),
+    Fact(
+        "filters.python, in which the stages run, takes only texts in UTF-8 from a LAS file",
+        _odd_text,
+        "Write the file anew without it, or run it with pdal-stages classify, which keeps it",
+        matters=_runs_python,
     ),
 )
 
@@ -159,22 +149,15 @@ def check_inputs(stages: Sequence[StageJson]) -> None:
     PipelineError
         Naming the file, what is wrong and the cure.
     """
-    version = None
-    facts = [*FACTS]
-    if any(writes_las(stage) and "extra_dims" in stage for stage in stages):
-        facts.append(_LEFT_OUT)
-    if any(stage["type"] in ("filters.python", *stage_types()) for stage in stages):
-        facts.append(_NO_TEXT)
+    facts = [fact for fact in FACTS if fact.matters(stages)]
     types: dict[str, tuple[str, str]] = {}
     for stage in stages:
         for path in readers_files([stage], las=True):
             if (header := header_there(path)) is None:
                 continue  # which reading it reports
             for fact in facts:
-                found = fact.shows(path, header, stage)
-                if found and fact.until != _ALWAYS:  # PDAL is asked only then
-                    version = version or pdal_env.version()
-                if found and (fact.until == _ALWAYS or (version or fact.until) < fact.until):
+                found = "" if stage.keys() & {*fact.unless} else fact.shows(path, header)
+                if found and (fact.until is None or pdal_env.version() < fact.until):
                     raise PipelineError(fact.what, where=path, found=found, cure=fact.cure)
             _compare_types(path, layout_there(path), types)
 
@@ -197,12 +180,9 @@ def overwritten_names(layout: Layout) -> list[str]:
 
     But for ClassFlags, the copy of the flags that PDAL before 2.3 itself writes with ``all``.
     """
-    own = {_plain(name) for name in layout.fields if name not in layout.extra_by_name} | {
-        "class",
-        "cls",
-    }
-    own.discard("classflags")
-    return [each.name for each in layout.extra if _plain(each.name) in own]
+    names = layout.fields.keys() - layout.extra_by_name.keys() - {"ClassFlags"}
+    taken = {"class", "cls", *map(_plain, names)}
+    return [each.name for each in layout.extra if _plain(each.name) in taken]
 
 
 def _plain(name: str) -> str:
@@ -218,7 +198,8 @@ def las_version(writer: StageJson, before: Sequence[StageJson]) -> tuple[int, in
     They come from its options, the forwarded header, or PDAL's defaults.
     """
     values: list[int | None] = []
-    forward, headers = str(writer.get("forward", "")), las_headers(before)
+    forward, files = str(writer.get("forward", "")), readers_files(before, las=True)
+    headers = [header for path in files if (header := header_there(path)) is not None]
     forwards = any(word in forward for word in ("all", "header", "minor_version"))
     for option, of_headers in (
         ("minor_version", {header.minor for header in headers}),
@@ -232,11 +213,6 @@ def las_version(writer: StageJson, before: Sequence[StageJson]) -> tuple[int, in
     defaults = pdal_env.las_writer_defaults() if None in values else (0, 0)
     minor, format_id = (d if v is None else v for v, d in zip(values, defaults, strict=True))
     return minor, format_id
-
-
-def las_headers(readers: Sequence[StageJson]) -> list[LasHeader]:
-    """Return the headers of the LAS files that stages read, where they can be read."""
-    return [h for h in map(header_there, readers_files(readers, las=True)) if h is not None]
 
 
 def check_class_codes(
@@ -315,9 +291,8 @@ def check_flags(stages: Sequence[StageJson]) -> None:
     for path in old if apart or len(old) < len(formats) else ():
         layout = Layout.of_file(path)
         for part in read_records(path, layout, only=["Classification"]):
-            if (part["class"] > LEGACY_LIMIT).any():
-                what, cure = FLAGS_IN_CLASSES, FLAGS_CURE
-                raise PipelineError(what, where=path, cure=cure)
+            if (layout.fields["Classification"].numbers(part) > LEGACY_LIMIT).any():
+                raise PipelineError(FLAGS_IN_CLASSES, where=path, cure=FLAGS_CURE)
 
 
 def check_copc_outputs(stages: Iterable[StageJson]) -> None:

@@ -20,7 +20,6 @@ from ..base.las import (
     named_las,
     projection_digest,
     records_of,
-    says_wkt,
 )
 from ..base.las_check import check_readable
 from ..base.units import (
@@ -147,10 +146,12 @@ def reference_of_las(path: str) -> tuple[str, str]:
     if not (text and keys):
         return text or (_wkt_of_keys(*keys) if keys else ""), ""
     of_keys = _wkt_of_keys(*keys)
-    taken, other = (text, of_keys) if says_wkt(path) else (of_keys, text)
+    header = header_there(path)
+    says_wkt = header is not None and header.says_wkt
+    taken, other = (text, of_keys) if says_wkt else (of_keys, text)
     if other and described(taken)[1] != described(other)[1]:
         kinds = ("its text", "its GeoTIFF keys")
-        first, second = kinds if says_wkt(path) else kinds[::-1]
+        first, second = kinds if says_wkt else kinds[::-1]
         return taken, (
             f"{path} names two spatial references: {first} ({name_of_wkt(taken)}) is taken, as its "
             f"header says, not {second} ({name_of_wkt(other)})"

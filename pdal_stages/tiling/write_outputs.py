@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.files import whole_files
 from ..base.json_types import JsonObject, StageJson
+from ..base.las import pdal_type
 from ..base.las_check import check_complete
 from ..base.las_copy import LasCopy
 from ..base.las_points import Layout, read_records
-from ..pipeline.copies import FLOATS, copy_of, named_types
+from ..pipeline.copies import copy_of, named_types
 from ..pipeline.inputs_outputs import LAS_WRITERS
 from ..pipeline.run import execute_whole
 from ..stages.points import class_counts
@@ -39,12 +40,8 @@ class PieceResults:
     values: dict[str, NDArray]  #: (n,) new values of dimensions
 
 
-@dataclass(frozen=True)
-class NewValues:
-    """New values for points that are read again, in their order."""
-
-    kept: NDArray[np.bool_]  #: (n,) which of the points remain
-    values: Mapping[str, NDArray]  #: (n,) new values of dimensions
+#: Records (n,) of an input that are written, and new values (n,) of their dimensions.
+Part = tuple[NDArray, Mapping[str, NDArray]]
 
 
 def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
@@ -72,10 +69,11 @@ def arrays_of(results: Iterable[PieceResults]) -> dict[str, NDArray]:
 
 def read_results(
     tiles: Iterable[str], source: InputSource, count: int, start: int, end: int
-) -> NewValues:
-    """Return the results of points `start` to `end` of a file, from the files of its tiles.
+) -> tuple[NDArray[np.bool_], dict[str, NDArray]]:
+    """Return which of the points `start` to `end` of a file remain (n,), and their new values (n,).
 
-    StageError where these do not contain each of the file's points once.
+    They are in the files of its tiles. StageError where these do not contain each of the file's
+    points once.
     """
     kept = np.zeros(end - start, bool)
     seen = 0
@@ -100,7 +98,7 @@ def read_results(
             where=source.path,
             found=f"{seen:,} of {count:,} points. Run it again without --resume",
         )
-    return NewValues(kept, values)
+    return kept, values
 
 
 def result_types(tiles: Iterable[str], source: InputSource) -> dict[str, np.dtype]:
@@ -116,57 +114,44 @@ def result_types(tiles: Iterable[str], source: InputSource) -> dict[str, np.dtyp
 # ---- copies with new values, and stages per output -----------------------------------------------
 
 
-@dataclass
-class PointsToWrite:
-    """Points of an input in parts, with new values, and the copy of the input that gets them."""
-
-    copy: LasCopy
-    #: Yields records (n,), which of them remain (n,), and new values of dimensions.
-    parts: Iterable[tuple[NDArray, NewValues]]
-    classes: Counter[str] = field(default_factory=Counter)
-
-    def write(self, target: Path) -> None:
-        """Write the copy."""
-        with self.copy.writing_to(target):
-            for records, new in self.parts:
-                kept = new.kept
-                values = {name: column[kept] for name, column in new.values.items()}
-                self.copy.write(records if kept.all() else records[kept], values)
-                if "Classification" in values:
-                    self.classes.update(class_counts(values["Classification"]))
-
-
 def run_tail(
-    sets: Sequence[PointsToWrite],
-    sources: Sequence[InputSource],
+    copies: Sequence[tuple[InputSource, LasCopy, Iterable[Part]]],
     plan: TilePlan,
     outputs: Sequence[str],
     scratch: str,
 ) -> JsonObject:
     """Write copies of inputs, in one output or through the stages per output; return a record.
 
-    The `outputs` get their names once all are complete, and only while the run with the temporary
-    folder `scratch` exists.
+    Each input comes with its copy and the parts that are written into it. The `outputs` get their
+    names once all are complete, and only while the run with the temporary folder `scratch` exists.
     """
+    classes: Counter[str] = Counter()
+
+    def write(copy: LasCopy, target: Path, parts: Iterable[Part]) -> None:
+        with copy.writing_to(target):
+            for records, values in parts:
+                copy.write(records, values)
+                if "Classification" in values:
+                    classes.update(class_counts(values["Classification"]))
 
     def check() -> None:
         if not Path(scratch).is_dir():  # the run was killed, and another one may be writing here
             raise StageError("the run that this belonged to has ended", found=scratch)
 
     def complete(partial: Path, final: Path, number: int) -> None:
-        check_complete(partial, final, plan.writers[0], sets[0].copy.count)
+        check_complete(partial, final, plan.writers[0], copies[0][1].count)
         check()
 
     if plan.copied:
         with whole_files(*outputs, check=complete) as (partial,):
-            sets[0].write(partial)
-        return _record(outputs, sets, sets[0].copy.count)
+            write(copies[0][1], partial, copies[0][2])
+        return {"outputs": written(outputs), "written": copies[0][1].count, "classes": classes}
     with TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True) as folder:
         stages: list[StageJson] = []
         listed: dict[str, str] = {}
-        for number, (each, source) in enumerate(zip(sets, sources, strict=True)):
+        for number, (source, copy, parts) in enumerate(copies):
             path = Path(folder) / f"{number}.las"
-            each.write(path)
+            write(copy, path, parts)
             stages.append({**source.reader_of_copy, "filename": str(path), "tag": f"in{number}"})
             listed |= named_types(Layout.of_file(path))
         stages.append({"type": "filters.merge", "inputs": [stage["tag"] for stage in stages]})
@@ -176,12 +161,7 @@ def run_tail(
             named = plan.extra_dims is not None and stage["type"] in LAS_WRITERS and dimensions
             stages.append({"extra_dims": dimensions, **plain} if named else plain)
         run, _ = execute_whole(stages, outputs, check, arrays=False)
-    return _record(outputs, sets, run.count)
-
-
-def _record(outputs: Sequence[str], sets: Sequence[PointsToWrite], count: int) -> JsonObject:
-    classes = sum((each.classes for each in sets), Counter[str]())
-    return {"outputs": written(outputs), "written": count, "classes": dict(classes)}
+    return {"outputs": written(outputs), "written": run.count, "classes": classes}
 
 
 def _copy(
@@ -190,8 +170,8 @@ def _copy(
     """Return a copy of an input with the dimensions of a plan; `types` are those of new values."""
     added = dict(plan.makes if plan.extra_dims is None else plan.extra_dims)
     if plan.creates is None:  # PDAL's filters may have made others, in between
-        named = {name: FLOATS.get(kind.name, f"{kind.name}_t") for name, kind in types.items()}
-        added = {name: kind for name, kind in named.items() if name not in layout.fields} | added
+        others = {n: pdal_type(kind) for n, kind in types.items() if n not in layout.fields}
+        added = others | added
     added.pop("Classification", None)
     return copy_of(source.path, layout, target, added, source.reader)
 
@@ -200,46 +180,35 @@ def _copy(
 
 
 def write_file(
-    plan: TilePlan,
-    source: InputSource,
-    results: list[str],
-    outputs: list[str],
-    scratch: str,
+    plan: TilePlan, source: InputSource, results: list[str], outputs: list[str], scratch: str
 ) -> JsonObject:
-    """Write the outputs of a file from the results of its tiles; return the record.
-
-    It has class counts.
-    """
+    """Write the outputs of a file from the results of its tiles; return the record."""
     assert source.index is not None
     count, layout = source.index.count, source.layout
 
-    def parts() -> Iterator[tuple[NDArray, NewValues]]:
+    def parts() -> Iterator[Part]:
         for start in range(0, count, MOST_AT_ONCE):
             end = min(count, start + MOST_AT_ONCE)
-            new, at = read_results(results, source, count, start, end), 0
+            (kept, values), at = read_results(results, source, count, start, end), 0
             for records in read_records(source.path, layout, start, end):
-                rows = slice(at, at + len(records))
-                values = {name: column[rows] for name, column in new.values.items()}
-                yield records, NewValues(new.kept[rows], values)
+                inside = np.flatnonzero(kept[at : at + len(records)])
+                new = {name: column[at + inside] for name, column in values.items()}
+                yield records[inside], new
                 at += len(records)
 
     types = result_types(results, source)
     copy = _copy(source, layout, plan, outputs[0] if plan.copied else ".las", types)
-    return run_tail([PointsToWrite(copy, parts())], [source], plan, outputs, scratch)
+    return run_tail([(source, copy, parts())], plan, outputs, scratch)
 
 
 def write_tile(
     results: list[PieceResults], plan: TilePlan, outputs: list[str], scratch: str
 ) -> JsonObject:
     """Write the points of a tile, from the files that were cut for it; return the record."""
-    results = [result for result in results if result.piece.own_rows.size]
-    if not results:
-        return {"outputs": []}
-    sets = []
-    for result in results:  # only the tile's own points remain
-        piece = result.piece
-        new = NewValues(np.ones(len(result.rows), bool), result.values)
-        types = {name: values.dtype for name, values in result.values.items()}
-        copy = _copy(piece.source, piece.layout, plan, ".las", types)
-        sets.append(PointsToWrite(copy, [(piece.records[result.rows], new)]))
-    return run_tail(sets, [result.piece.source for result in results], plan, outputs, scratch)
+    copies = []
+    for piece, rows, values in ((r.piece, r.rows, r.values) for r in results):
+        if piece.own_rows.size:  # only the tile's own points remain
+            types = {name: column.dtype for name, column in values.items()}
+            copy = _copy(piece.source, piece.layout, plan, ".las", types)
+            copies.append((piece.source, copy, [(piece.records[rows], values)]))
+    return run_tail(copies, plan, outputs, scratch) if copies else {"outputs": []}
