@@ -205,7 +205,7 @@ class LasCopy:
         new = np.zeros(len(part), np.dtype((np.void, self.point_bytes)))
         raw = bytes_of(new)
         raw[:, : part.itemsize] = bytes_of(part)
-        for name in values.keys() & self.fields.keys():
+        for name in [name for name in values if name in self.fields]:
             field, column = self.fields[name], values[name]
             if name == "Classification":
                 self._check_codes(column)
@@ -240,7 +240,6 @@ class LasCopy:
             self._encoder = None  # which holds the file
         file.seek(0, os.SEEK_END)
         shifts = self._write_tail()
-
         if self.count != header.count:
             self._patch(107, "<I", self.count if self.layout.is_old else 0)
             if header.minor >= 4:
