@@ -33,54 +33,40 @@ ENTRY = 192
 MOST_ENTRIES = 65_535 // ENTRY
 #: Types of extra bytes 1 to 10; 11 to 20 are pairs, 21 to 30 triples of these.
 TYPES = tuple(map(np.dtype, ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")))
-_COORDINATES = [("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("Intensity", "<u2"), ("returns", "u1")]
-#: Fields of a point of formats 0 to 5, and of 6 to 10, in their order.
-_OLD = [*_COORDINATES, ("class", "u1"), ("ScanAngleRank", "i1"), ("UserData", "u1"),
-        ("PointSourceId", "<u2")]  # fmt: skip
-_NEW = [*_COORDINATES, ("flags", "u1"), ("class", "u1"), ("UserData", "u1"),
-        ("ScanAngleRank", "<i2"), ("PointSourceId", "<u2"), ("GpsTime", "<f8")]  # fmt: skip
-_TIME = [("GpsTime", "<f8")]
-_COLORS = [("Red", "<u2"), ("Green", "<u2"), ("Blue", "<u2")]
-_INFRARED = [("Infrared", "<u2")]
-_WAVE = [("waveform", "V29")]
-#: Fields that follow, by point format.
-_MORE: tuple[list[tuple[str, str]], ...] = (
-    *([], _TIME, _COLORS, _TIME + _COLORS, _TIME + _WAVE, _TIME + _COLORS + _WAVE),
-    *([], _COLORS, _COLORS + _INFRARED, _WAVE, _COLORS + _INFRARED + _WAVE),
-)
-#: Dimensions that are bits of a field: its name, the lowest bit and the number of bits.
-_OLD_BITS = {
-    "ReturnNumber": ("returns", 0, 3),
-    "NumberOfReturns": ("returns", 3, 3),
-    "ScanDirectionFlag": ("returns", 6, 1),
-    "EdgeOfFlightLine": ("returns", 7, 1),
-    "Classification": ("class", 0, 5),
-    "Synthetic": ("class", 5, 1),
-    "KeyPoint": ("class", 6, 1),
-    "Withheld": ("class", 7, 1),
-}
-_NEW_BITS = {
-    "ReturnNumber": ("returns", 0, 4),
-    "NumberOfReturns": ("returns", 4, 4),
-    "ClassFlags": ("flags", 0, 4),
-    "Synthetic": ("flags", 0, 1),
-    "KeyPoint": ("flags", 1, 1),
-    "Withheld": ("flags", 2, 1),
-    "Overlap": ("flags", 3, 1),
-    "ScanChannel": ("flags", 4, 2),
-    "ScanDirectionFlag": ("flags", 6, 1),
-    "EdgeOfFlightLine": ("flags", 7, 1),
-    "Classification": ("class", 0, 8),
-}
 #: Degrees of a step of the scan angle in formats 6 to 10.
 _ANGLE_STEP = 0.006
-#: What lazrs must decode of LAZ 1.4 for a field, beside X, Y and the returns, by its names.
-_LAYERS = {
-    "Z": "Z", "Intensity": "INTENSITY", "flags": "FLAGS", "class": "CLASSIFICATION",
-    "UserData": "USER_DATA", "ScanAngleRank": "SCAN_ANGLE", "PointSourceId": "POINT_SOURCE_ID",
-    "GpsTime": "GPS_TIME", "Red": "RGB", "Green": "RGB", "Blue": "RGB", "Infrared": "NIR",
-    "extra": "ALL_EXTRA_BYTES", "waveform": "WAVEPACKET",
-}  # fmt: skip
+#: Dimensions of points: name, what lazrs must decode of LAZ 1.4 for it beside X, Y and the returns,
+#: and in formats 0 to 5 and in formats 6 to 10: byte, type, lowest bit, number of bits (0: all).
+_ALWAYS: tuple[
+    tuple[str, str, tuple[int, str, int, int] | None, tuple[int, str, int, int]], ...
+] = (
+    ("X", "", (0, "<i4", 0, 0), (0, "<i4", 0, 0)),
+    ("Y", "", (4, "<i4", 0, 0), (4, "<i4", 0, 0)),
+    ("Z", "Z", (8, "<i4", 0, 0), (8, "<i4", 0, 0)),
+    ("Intensity", "INTENSITY", (12, "<u2", 0, 0), (12, "<u2", 0, 0)),
+    ("ScanAngleRank", "SCAN_ANGLE", (16, "i1", 0, 0), (18, "<i2", 0, 0)),
+    ("UserData", "USER_DATA", (17, "u1", 0, 0), (17, "u1", 0, 0)),
+    ("PointSourceId", "POINT_SOURCE_ID", (18, "<u2", 0, 0), (20, "<u2", 0, 0)),
+    ("ReturnNumber", "", (14, "u1", 0, 3), (14, "u1", 0, 4)),
+    ("NumberOfReturns", "", (14, "u1", 3, 3), (14, "u1", 4, 4)),
+    ("ClassFlags", "FLAGS", None, (15, "u1", 0, 4)),
+    ("Synthetic", "FLAGS", (15, "u1", 5, 1), (15, "u1", 0, 1)),
+    ("KeyPoint", "FLAGS", (15, "u1", 6, 1), (15, "u1", 1, 1)),
+    ("Withheld", "FLAGS", (15, "u1", 7, 1), (15, "u1", 2, 1)),
+    ("Overlap", "FLAGS", None, (15, "u1", 3, 1)),
+    ("ScanChannel", "FLAGS", None, (15, "u1", 4, 2)),
+    ("ScanDirectionFlag", "FLAGS", (14, "u1", 6, 1), (15, "u1", 6, 1)),
+    ("EdgeOfFlightLine", "FLAGS", (14, "u1", 7, 1), (15, "u1", 7, 1)),
+    ("Classification", "CLASSIFICATION", (15, "u1", 0, 5), (16, "u1", 0, 8)),
+)
+#: Those of some formats: name, what lazrs must decode, type, and the byte by point format.
+_OF_FORMATS = (
+    ("GpsTime", "GPS_TIME", "<f8", {1: 20, 3: 20, 4: 20, 5: 20, **dict.fromkeys(range(6, 11), 22)}),
+    ("Red", "RGB", "<u2", {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}),
+    ("Green", "RGB", "<u2", {2: 22, 3: 30, 5: 30, 7: 32, 8: 32, 10: 32}),
+    ("Blue", "RGB", "<u2", {2: 24, 3: 32, 5: 32, 7: 34, 8: 34, 10: 34}),
+    ("Infrared", "NIR", "<u2", {8: 36, 10: 36}),
+)
 
 
 class Field(NamedTuple):
@@ -176,7 +162,7 @@ def extra_fields(header: LasHeader, data: bytes) -> list[Field]:
             )
             title, begin = name if count == 1 else f"{name}{n}", at + n * kind.itemsize
             scaling = () if (scale, shift) == (1.0, 0.0) else (scale, shift)
-            fields.append(Field(title, begin, kind, _LAYERS["extra"], *scaling))
+            fields.append(Field(title, begin, kind, "ALL_EXTRA_BYTES", *scaling))
         at += size
     if at > header.point_bytes:
         room = header.extra_bytes
@@ -241,17 +227,19 @@ class Layout:
     def fields(self) -> dict[str, Field]:
         """Return all dimensions by name; extra bytes named like one of the format are none."""
         header = self.header
-        listed = np.dtype((_OLD if self.is_old else _NEW) + _MORE[header.point_format])
         axes = zip(header.scales, header.offsets, strict=True)
-        scales = dict(zip(AXES, axes, strict=True))
+        scales: dict[str, tuple[float, float]] = dict(zip(AXES, axes, strict=True))
         scales["ScanAngleRank"] = 1.0 if self.is_old else _ANGLE_STEP, 0.0
-        parts = {
-            name: Field(name, at, kind, _LAYERS.get(name, ""), *scales.get(name, ()))
-            for name, (kind, at, *_) in (listed.fields or {}).items()
-        }
-        fields = {name: part for name, part in parts.items() if name[0].isupper()}
-        for name, (part, low, bits) in (_OLD_BITS if self.is_old else _NEW_BITS).items():
-            fields[name] = parts[part]._replace(name=name, low=low, bits=bits)
+        places = [(name, layer, old if self.is_old else new) for name, layer, old, new in _ALWAYS]
+        for name, layer, kind, by_format in _OF_FORMATS:
+            at = by_format.get(header.point_format)
+            places.append((name, layer, (at, kind, 0, 0) if at else None))
+        fields: dict[str, Field] = {}
+        for name, layer, place in places:
+            if place is not None:
+                at, kind, low, bits = place
+                scale, shift = scales.get(name, (None, 0.0))
+                fields[name] = Field(name, at, np.dtype(kind), layer, scale, shift, low, bits)
         return fields | {each.name: each for each in self.extra if each.name not in {"", *fields}}
 
     @cached_property
