@@ -104,7 +104,11 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     if real.is_dir():
         refuse("the {} file names a folder", "Give a file name")
     if not os.access(real.parent, os.W_OK):
-        refuse("the folder of the {} file cannot be written to", value=str(real.parent))
+        refuse(
+            "the folder of the {} file cannot be written to",
+            "Give another folder, or change its mode",
+            str(real.parent),
+        )
     if real.exists() and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):
         refuse("the {} file is write-protected", "Give another name, or change its mode")
     if is_open_database(real):
@@ -113,6 +117,18 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
     if older and older != kind:
         cure = "Give another name, or remove that file first"
         refuse(f"the {{}} file would replace {older}", cure)
+
+
+def create_folder(path: str | os.PathLike, what: str) -> None:
+    """Create a folder of `what` and those above it; StageError where that fails."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StageError(
+            f"the folder of {what} cannot be created",
+            found=f"{path}: {error.strerror}",
+            cure="Give another folder, or change the mode of the one above it",
+        ) from None
 
 
 def _trusted() -> set[int]:

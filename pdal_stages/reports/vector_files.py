@@ -47,7 +47,7 @@ def check_target(path: str | Path, layers: Sequence[str]) -> None:
     vector("pyogrio")
     vector("shapely")
     for name in target_files(path, layers):
-        check_writable(name, "vector file")
+        check_writable(name, "vector")
 
 
 def target_files(path: str | Path, layers: Sequence[str]) -> list[Path]:

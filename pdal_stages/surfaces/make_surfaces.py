@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError, optional_import
-from ..base.files import Output, check_outputs
+from ..base.files import Output, check_outputs, create_folder
 from ..base.geotiff import rasterio
 from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
@@ -90,11 +90,7 @@ def write_surfaces(
     paths = {name: place / f"{name}.tif" for name in RASTERS}
     options, chosen = options or SurfaceOptions(), replace(tiling or TilingOptions(), per="tile")
     survey = CellSurvey("surfaces", files, place, chosen, options)
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        what = "the folder of the rasters cannot be created"
-        raise StageError(what, found=f"{folder}: {error.strerror}") from None
+    create_folder(place, "the rasters")
     check_outputs([Output(str(path), "raster") for path in paths.values()], files)
     with record_run(survey, chosen, place, progress) as run:
         return _run(run, paths, options)

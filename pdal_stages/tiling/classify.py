@@ -10,8 +10,8 @@ from functools import cached_property
 from pathlib import Path
 
 from ..base import las
-from ..base.errors import DimensionError, OptionError, StageError
-from ..base.files import Output, check_outputs
+from ..base.errors import DimensionError, OptionError
+from ..base.files import Output, check_outputs, create_folder
 from ..base.las_points import layout_there
 from ..pipeline.classify_file import classify_file
 from ..pipeline.classify_request import ClassifyRequest
@@ -70,13 +70,7 @@ class ClassifyTask:
         try:
             for folder in sorted({folder for name in names for folder in Path(name).parents}):
                 if not folder.is_dir():
-                    try:
-                        folder.mkdir(exist_ok=True)
-                    except OSError as error:
-                        raise StageError(
-                            "the output folder cannot be created",
-                            found=f"{folder}: {error.strerror}",
-                        ) from None
+                    create_folder(folder, "the output")
                     created.append(folder)
             yield
         finally:

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import DependencyError, StageError
-from ..base.files import sweep
+from ..base.errors import DependencyError
+from ..base.files import create_folder, sweep
 from ..base.jit import count_cached_kernels
 from ..base.json_types import StageJson
 from ..base.messages import print_messages
@@ -96,11 +96,7 @@ def run_plan(
         _try_on_an_input(pipeline, survey, len(plan.readers))
     if dry_run:
         return estimate(plan, survey)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        what = "the folder of the output cannot be created"
-        raise StageError(what, found=f"{folder}: {error.strerror}") from None
+    create_folder(folder, "the output")
     if plan.makes and progress is not False and not chosen.scheduler and not count_cached_kernels():
         print_messages("compiling for this processor first, once: it takes a minute or two")
     folders = {folder, *(Path(path).parent for paths in survey.outputs for path in paths)}

@@ -129,6 +129,17 @@ def test_no_rights(capfd, write_las):
             "pipeline", job(folder, source, HAG, closed / "out.las"), says=["cannot be written to"]
         )
         refused("train", source, "--model", closed / "m", says=["cannot be written to"])
+        for words, says in (
+            (["classify", source, closed / "out.las"], "folder of the output file"),
+            (["classify", source, f"{closed}/"], "folder of the output file"),
+            (["classify", source, f"{closed}/below/"], "folder of the output cannot be created"),
+            (["surfaces", source, closed / "below"], "folder of the rasters cannot be created"),
+            (["objects", source, closed / "o.gpkg"], "folder of the vector file cannot"),
+            (["review", source, closed / "r.gpkg"], "folder of the vector file cannot"),
+            (["report", source, closed / "p.html"], "folder of the report file cannot"),
+        ):
+            refused(*words, says=[says, "Give another folder"])
+        assert not list(closed.iterdir())
         for path in (source, plain):
             path.chmod(0o000)
         refused("pipeline", job(folder, source, HAG), says=["in.las", "Permission denied"])
