@@ -145,25 +145,22 @@ def check_complete(
         size = path.stat().st_size
         with open(path, "rb+") as file:
             os.fsync(file.fileno())  # some file systems report a full disk only here
-        whole = _is_whole(path, count) if las else not disk_is_full(path)
+        if las:
+            check_readable(path)
+            header = read_header(path)
+            whole = header is not None and count in (None, header.count)
+        else:
+            whole = not disk_is_full(path)
     except OSError as error:
         raise StageError("the output file cannot be read back", found=f"{name}: {error}") from error
+    except StageError:  # the file is damaged
+        whole = False
     if not whole:
         raise StageError(
             "the output file could not be written completely",
             found=f"{name}: {size:,} bytes were written",
             cure="Make room on the disk",
         )
-
-
-def _is_whole(path: Path, count: int | None) -> bool:
-    """Return whether a LAS file is undamaged and holds `count` points; None allows any number."""
-    try:
-        check_readable(path)
-    except StageError:
-        return False
-    header = read_header(path)
-    return header is not None and count in (None, header.count)
 
 
 def _require(good: bool, what: str, found: str) -> None:

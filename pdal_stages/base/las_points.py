@@ -33,6 +33,7 @@ ENTRY = 192
 MOST_ENTRIES = 65_535 // ENTRY
 #: Types of extra bytes 1 to 10; 11 to 20 are pairs, 21 to 30 triples of these.
 TYPES = tuple(map(np.dtype, ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")))
+
 #: Degrees of a step of the scan angle in formats 6 to 10.
 _ANGLE_STEP = 0.006
 #: Dimensions of points: name, what lazrs must decode of LAZ 1.4 for it beside X, Y and the returns,

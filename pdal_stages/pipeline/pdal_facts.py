@@ -88,7 +88,7 @@ class Fact(NamedTuple):
     cure: str
     until: tuple[int, int, int] | None = None  #: the first version that does not; None: all do
     unless: Collection[str] = ()  #: options of the reader with which it does not
-    #: Takes all stages of the pipeline; returns whether it matters to them.
+    #: Takes all stages of the pipeline; returns whether it matters to them. By default it does.
     matters: Callable[[Sequence[StageJson]], bool] = bool
 
 
