@@ -80,13 +80,20 @@ def describe_wires(scores: dict[str, list[dict[str, Any]]]) -> str:
         "|---|---:|---:|---:|",
     ]
     rows = []
-    for density in dict.fromkeys(row["density"] for row in scores["strips"]):
-        strips = [row for row in scores["strips"] if row["density"] == density]
-        rows.append(
-            (f"wires of the labeled line, strip by strip, at {density:g}/m²", "wire", strips)
-        )
+    for name in ("wire", "tower"):
+        for density in dict.fromkeys(row["density"] for row in scores["strips"]):
+            strips = [row for row in scores["strips"] if row["density"] == density]
+            title = f"{name}s of the labeled line, strip by strip, at {density:g}/m²"
+            rows.append((title, name, strips))
     for row in scores["strands"]:
         rows.append((f"single strands hung over {row['survey']}", "wire", [row]))
+    for landscape in dict.fromkeys(row["landscape"] for row in scores["lines"] if row["tower"]):
+        each = [row for row in scores["lines"] if row["landscape"] == landscape]
+        wires = sum(row.get("tower beside", 0) for row in each)
+        title = (
+            f"towers of lines set into others: {landscape} ({wires} of the false points are wires)"
+        )
+        rows.append((title, "tower", each))
     for name in ("wire", "tower") if "crops" in scores else ():
         title = f"{name}s in helicopter scans of Portuguese lines, 80 to 100/m² (not trained on)"
         rows.append((title, name, scores["crops"]))

@@ -1,11 +1,13 @@
 """Score wires and towers by models that have not seen them.
 
-    python benchmarks/surveys/wires.py --data DIR --models MODELS --surveys FILE --json FILE [--crops FOLDER]
+    python benchmarks/surveys/wires.py --data DIR --models MODELS --surveys FILE --json FILE \\
+        [--crops FOLDER]
 
 MODELS are those of `leave_one_out.py --save`, FILE its figures. Strips of the labeled line,
 thinned, are classified by models that have neither the strip nor copies of its wires, and single
-strands over two surveys by models without their groups. `--crops` adds helicopter scans
-of power lines, which no license lets anybody train on, by the shipped model.
+strands over two surveys, and lines with towers set into all others, by models without their groups.
+`--crops` adds helicopter scans of power lines, which no license lets anybody train on, by the
+shipped model. Towers are found as `filters.towers` finds them.
 """
 
 from __future__ import annotations
@@ -16,20 +18,22 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import laspy
 import numpy as np
 from clouds import Cloud, load, model_without, slug, thinned
 from folds import STRIP_OF_GROUP
-from lines import STRIPS, LabeledLine, hang_strands, labeled_line
+from lines import STRIPS, LabeledLine, arrange, hang_strands, labeled_line, string_line
 from recipe import set_in
 from scipy.spatial import cKDTree
 from surveys import FOREST, GROUND, LINE_SURVEY, SLOPE, SURVEYS, TOWER, WIRE
 
-from pdal_stages.classifier.model import load_model
+from pdal_stages.classifier.model import Model, load_model
 from pdal_stages.classifier.prediction import Prediction
 from pdal_stages.reports.pictures import png, triptych
 from pdal_stages.stages.preprocessing import PREPARATION
+from pdal_stages.structures.towers import find_towers
 from pdal_stages.terrain import detached_noise, filtered_ground
 
 #: Points per square meter of the strips.
@@ -44,6 +48,12 @@ DUTCH_DENSITY = 2.0
 TOWER_FROM = 3.0
 #: The strip that the card has pictures of.
 PICTURED = 1
+#: Points per square meter of surveys that lines with towers are set into.
+LINE_DENSITIES = (7.0, 2.0)
+#: Numbers of lines that are set into each: training has lower ones (`recipe.py`).
+LINES = (1000, 1001, 1002)
+#: Meters from a line within which points are classified.
+NEAR_LINE = 40.0
 #: Label of noise of the crops.
 NOISE = 7
 
@@ -63,6 +73,13 @@ def count(found: np.ndarray, truth: np.ndarray) -> dict[str, int]:
             np.count_nonzero((truth != code) & (truth > 0) & (found == code))
         )
     return out
+
+
+def with_towers(codes: np.ndarray, xyz: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Return classes (n,) with towers, of points (n, 3) with heights (n,)."""
+    every = np.ones(len(codes), np.bool_)
+    tower = find_towers(xyz, np.asarray(height, float), every, codes == WIRE)
+    return np.where(tower, TOWER, codes).astype(np.uint8)
 
 
 def classified_strips(
@@ -87,6 +104,9 @@ def classified_strips(
             inside = (after[rows] >= 0) & (after[rows] <= width)
             model = load_model(str(models / f"{slug(group)}.model"))
             found = model.predict(part.xyz, part.dimensions)
+            height = part.dimensions["HeightAboveGround"]
+            codes = with_towers(found.classification, part.xyz, height)
+            found = replace(found, classification=codes)
             if pictures and strip == PICTURED and density == STRIP_DENSITIES[0]:
                 draw(
                     line,
@@ -135,6 +155,51 @@ def strands(data: Path, models: Path) -> list[dict[str, Any]]:
     return out
 
 
+def lines_set_in(data: Path, models: Path) -> list[dict[str, Any]]:
+    """Score wires and towers of lines that are set into surveys, high and medium voltage alike.
+
+    `tower beside` are false points of towers that are wires.
+    """
+    line, out = labeled_line(data), []
+    for name, survey in SURVEYS.items():
+        if survey.tells(WIRE):
+            continue
+        every, in_group = load(data, name), survey.group in STRIP_OF_GROUP
+        model = load_model(str(model_without(models, name) if in_group else lines_model(models)))
+        strip = STRIP_OF_GROUP.get(survey.group, line.strip_of_tower)
+        for density in LINE_DENSITIES:
+            if (cloud := thinned(every, density)) is None:
+                continue
+            for number in LINES:
+                seed = (crc32(name.encode()), number)
+                if arrange(line, np.random.default_rng(list(seed))).tower:
+                    row = line_set_in(cloud, line, strip, seed, model)
+                    out.append({"landscape": survey.landscape, "density": density, **row})
+                    print(out[-1], flush=True)
+    return out
+
+
+def line_set_in(
+    cloud: Cloud, line: LabeledLine, strip: int, seed: tuple[int, int], model: Model
+) -> dict[str, Any]:
+    """Score a line that is set into a cloud: the points near it."""
+    ground = cloud.xyz[:, 2] - cloud.dimensions["HeightAboveGround"]
+    implant = string_line(line, (strip,), cloud.xyz, ground, cloud.density, seed)
+    every = np.ones(len(cloud.xyz), np.uint8)
+    cloud = set_in(replace(cloud, truth=every), implant)
+    if not len(implant.xyz):
+        return {"cloud": cloud.name, "number": seed[1], **count(cloud.truth[:0], cloud.truth[:0])}
+    near = cKDTree(implant.xyz[:, :2]).query(cloud.xyz[:, :2])[0] < NEAR_LINE
+    found = model.predict(cloud.xyz, cloud.dimensions, where=near)
+    height = np.asarray(cloud.dimensions["HeightAboveGround"])
+    codes = with_towers(found.classification, cloud.xyz, height)
+    low = (cloud.truth == TOWER) & (height < TOWER_FROM)
+    truth = np.where(near & ~low, cloud.truth, 0)
+    beside = int(np.count_nonzero((truth == WIRE) & (codes == TOWER)))
+    scores = count(codes, truth)
+    return {"cloud": cloud.name, "number": seed[1], **scores, "tower beside": beside}
+
+
 def false_ones(data: Path, models: Path, runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return counts of wires and towers in surveys that have none.
 
@@ -151,6 +216,7 @@ def false_ones(data: Path, models: Path, runs: list[dict[str, Any]]) -> list[dic
         one = thinned(load(data, name), DUTCH_DENSITY) if name != LINE_SURVEY else None
         if one is not None:
             found = model.predict(one.xyz, one.dimensions).classification
+            found = with_towers(found, one.xyz, one.dimensions["HeightAboveGround"])
             counts = {
                 f"{word} false": int(np.count_nonzero(found == code))
                 for word, code in (("wire", WIRE), ("tower", TOWER))
@@ -177,6 +243,7 @@ def crops(folder: Path) -> list[dict[str, Any]]:
         none = np.zeros(len(xyz), np.uint8)
         dimensions = {**values, "ReturnNumber": none, "NumberOfReturns": none}
         found = model.predict(xyz, dimensions).classification
+        found = with_towers(found, xyz, values["HeightAboveGround"])
         ground = codes == GROUND
         near = cKDTree(xyz[ground, :2]).query(xyz[:, :2])[1]
         low = xyz[:, 2] - xyz[ground, 2][near] < TOWER_FROM
@@ -218,14 +285,18 @@ def main() -> None:
     scores = {
         "strips": strips(args.data, args.models),
         "strands": strands(args.data, args.models),
+        "lines": lines_set_in(args.data, args.models),
         "false": false_ones(
             args.data, args.models, json.loads(args.surveys.read_text())["surveys"]
         ),
         **({"crops": crops(args.crops)} if args.crops else {}),
     }
     for title, rows in scores.items():
-        if title != "false":
+        if title not in ("false", "lines"):
             print(summarize(title, rows))
+    for landscape in dict.fromkeys(row["landscape"] for row in scores["lines"]):
+        rows = [row for row in scores["lines"] if row["landscape"] == landscape]
+        print(summarize(f"lines set in, {landscape}", rows))
     for wooded in (False, True):
         rows = [row for row in scores["false"] if row["wooded"] == wooded]
         print(summarize("woods and slopes" if wooded else "other surveys", rows))
