@@ -11,6 +11,7 @@ southernmost.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -130,9 +131,20 @@ class GridWindow(NamedTuple):
 
     @classmethod
     def enclosing(cls, column: npt.NDArray, row: npt.NDArray) -> GridWindow:
-        """Return the smallest window with all of some cells, of which there must be one."""
+        """Return the smallest window with all of some cells, empty where there are none."""
+        if not (column.size and row.size):
+            return cls(0, 0, 0, 0)
         left, bottom = int(column.min()), int(row.min())
         return cls(left, bottom, int(column.max()) + 1 - left, int(row.max()) + 1 - bottom)
+
+    @classmethod
+    def union(cls, windows: Iterable[GridWindow]) -> GridWindow:
+        """Return the smallest window with the cells of all windows."""
+        boxes = [
+            (w.left, w.bottom, w.left + w.width, w.bottom + w.height) for w in windows if w.width
+        ]
+        left, bottom, right, top = np.array(boxes, np.int64).reshape(-1, 4).T
+        return cls.enclosing(np.append(left, right - 1), np.append(bottom, top - 1))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -6,8 +6,9 @@ the same ones. What is kept of a cell does not depend on the order of points.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +70,43 @@ def steps(coordinate: NDArray) -> Integers:
     return np.rint(np.asarray(coordinate) * STEPS).astype(np.int64)
 
 
+def cells_at(points: Integers, side: float) -> Integers:
+    """Return columns and rows (2, n) of the cells of points (n, 2 or more), all in steps."""
+    return cell_numbers(points[:, :2].T.astype(float), side)
+
+
+class CellRule(NamedTuple):
+    """A rule by which the values of a cell become one; a cell without any holds `empty`."""
+
+    merge: np.ufunc
+    empty: int
+
+    def rasterize(self, name: str, cells: Integers, value: Integers) -> dict[str, NDArray]:
+        """Return a raster (rows, columns) int64 by its name, and its ``*_window``.
+
+        `cells` (2, n) are columns and rows of values (n,).
+        """
+        window = GridWindow.enclosing(*cells)
+        raster = np.full(window.width * window.height, self.empty)
+        self.merge.at(raster, window.flat_index(*cells), value)
+        return {name: raster.reshape(window.shape), f"{name}_window": np.array(window)}
+
+    def join(
+        self, name: str, parts: Iterable[Mapping[str, NDArray]], window: GridWindow
+    ) -> Integers:
+        """Return a raster of a window, of those (:meth:`rasterize`) of several parts."""
+        out = np.full(window.shape, self.empty)
+        for arrays in parts:
+            part = GridWindow(*arrays[f"{name}_window"].tolist())
+            both = window.intersect(part)
+            place = out[both.slices_in(window)]
+            self.merge(place, arrays[name][both.slices_in(part)], out=place)
+        return out
+
+
+HIGHEST = CellRule(np.maximum, EMPTY)
+
+
 def usable(part: Mapping[str, NDArray], lone: LonePoints) -> NDArray[np.bool_]:
     """Return which points (n,) count: not noise, not withheld, not alone."""
     kept = ~np.isin(part["Classification"], NOISE) & (part["Withheld"] == 0)
@@ -85,42 +123,31 @@ def reduce_points(
     Returns
     -------
     arrays : dict
-        ``ground`` (k, 3) int64: points in steps; ``window`` (4,): a :class:`GridWindow`; ``top``
-        and ``solid`` (rows, columns) int64: twice the greatest height in steps, plus 1 where that
-        is not ground; of ``solid`` without wires and towers; or :data:`EMPTY`.
+        ``ground`` (k, 3) int64: points in steps; ``top`` and ``solid``, rasters as of
+        :meth:`CellRule.rasterize`: twice the greatest height in steps, plus 1 where that is not
+        ground; of ``solid`` without wires and towers.
     figures : dict
-        ``window``, and ``ground``: the number of ground points.
+        ``window`` of all points, and ``ground``: the number of ground points.
     """
-    columns = []
+    columns = [np.empty((0, 4), np.int64)]
     for _, part in parts:
-        codes, kept = part["Classification"], usable(part, lone)
-        xyz = np.column_stack([steps(part[name][kept]) for name in "XYZ"])
-        columns.append((xyz.reshape(-1, 3), codes[kept]))
-    xyz = np.concatenate([np.empty((0, 3), np.int64), *(points for points, _ in columns)])
-    codes = np.concatenate([np.empty(0, np.uint8), *(codes for _, codes in columns)])
-    if not len(xyz):
-        nothing = np.empty((0, 0), np.int64)
-        arrays = {"ground": xyz, "window": np.zeros(4, np.int64), "top": nothing, "solid": nothing}
-        return arrays, {"window": [0, 0, 0, 0], "ground": 0}
+        axes = [steps(part[name]) for name in "XYZ"]
+        columns.append(np.column_stack([*axes, part["Classification"]])[usable(part, lone)])
+    points = np.concatenate(columns)
+    xyz, codes = points[:, :3], points[:, 3]
     is_ground = np.isin(codes, TERRAIN)
     ground = lowest(xyz[is_ground], options.ground_step(unit))
-    column, row = (cell_numbers(xyz[:, k].astype(float), options.step) for k in (0, 1))
-    window = GridWindow.enclosing(column, row)
-    cell, value = window.flat_index(column, row), 2 * xyz[:, 2] + ~is_ground
-    top, solid = (np.full(window.width * window.height, EMPTY) for _ in range(2))
-    np.maximum.at(top, cell, value)
+    cells, value = cells_at(xyz, options.step), 2 * xyz[:, 2] + ~is_ground
     low = ~np.isin(codes, WIRES_AND_TOWERS)
-    np.maximum.at(solid, cell[low], value[low])
-    rasters = {"top": top.reshape(window.shape), "solid": solid.reshape(window.shape)}
-    figures = {"window": list(window), "ground": len(ground)}
-    return {"ground": ground, "window": np.array(window), **rasters}, figures
+    arrays = HIGHEST.rasterize("top", cells, value)
+    arrays |= HIGHEST.rasterize("solid", cells[:, low], value[low])
+    figures = {"window": arrays["top_window"].tolist(), "ground": len(ground)}
+    return {"ground": ground, **arrays}, figures
 
 
 def lowest(xyz: Integers, side: float) -> Integers:
     """Return the lowest of points (n, 3) in each cell of a side, row by row, then by x and y."""
-    column, row = (cell_numbers(xyz[:, k].astype(float), side) for k in (0, 1))
-    if not len(xyz):
-        return xyz
+    column, row = cells_at(xyz, side)
     window = GridWindow.enclosing(column, row)
     if window.width * window.height <= 8 * len(xyz):  # most points go without sorting
         floor, cell = np.full(window.width * window.height, -EMPTY), window.flat_index(column, row)
@@ -140,6 +167,11 @@ class CellDensity(Density):
 
     options: SurfaceOptions = SurfaceOptions()
     unit: float = 1.0  #: meters per unit of the coordinates
+
+    @classmethod
+    def with_cells(cls, options: SurfaceOptions, density: Density, unit: float) -> CellDensity:
+        """Return a density of points with that of cells."""
+        return cls(**vars(density), options=options, unit=unit)
 
     def is_fair(self, side: float) -> bool:
         """Return whether tiles of this side have not too many points or cells."""

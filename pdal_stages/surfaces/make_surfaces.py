@@ -2,54 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import StageError, optional_import
 from ..base.files import Output, check_outputs, create_folder
-from ..base.geotiff import rasterio
+from ..base.geotiff import rasterio, write_rasters
 from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
 from ..base.messages import print_messages
 from ..pipeline.inputs_outputs import input_files
-from ..tiling.inputs import Survey
-from ..tiling.options import Density, TilingOptions
-from ..tiling.tile_records import RecordRun, Tile, earlier_layout, plan_of_records, record_run
+from ..tiling.options import TilingOptions
+from ..tiling.tile_records import RecordRun, RecordSurvey, Tile, record_run
 from .cells import CellDensity, SurfaceOptions, reduce_points
-from .geotiff import write_rasters
 from .rasters import RASTERS, TileCells, compute_tile
 
 #: Share of cells with a height below which a message says so: 0.1 % are a line 100 m wide that
 #: crosses 70 km.
 _NEARLY_EMPTY = 1e-3
-
-
-class CellSurvey(Survey):
-    """A survey whose tiles are chosen for the memory of cells, too."""
-
-    def __init__(
-        self,
-        name: str,
-        files: Sequence[str],
-        folder: Path,
-        tiling: TilingOptions,
-        cell_options: SurfaceOptions,
-    ) -> None:
-        """Find and check the inputs, and choose tiles."""
-        self.cell_options = cell_options
-        plan = plan_of_records(name, files)
-        super().__init__(plan, tiling, earlier_layout(folder, tiling))
-
-    def measure_density(self) -> Density:
-        """Return the density of points, with that of cells."""
-        density = super().measure_density()
-        return CellDensity(**vars(density), options=self.cell_options, unit=self.unit)
 
 
 def write_surfaces(
@@ -88,11 +63,12 @@ def write_surfaces(
     files = input_files(inputs)
     place = Path(folder)
     paths = {name: place / f"{name}.tif" for name in RASTERS}
-    options, chosen = options or SurfaceOptions(), replace(tiling or TilingOptions(), per="tile")
-    survey = CellSurvey("surfaces", files, place, chosen, options)
+    options = options or SurfaceOptions()
+    measure = partial(CellDensity.with_cells, options)
+    survey = RecordSurvey("surfaces", files, place, tiling, measure)
     create_folder(place, "the rasters")
     check_outputs([Output(str(path), "raster") for path in paths.values()], files)
-    with record_run(survey, chosen, place, progress) as run:
+    with record_run(survey, progress) as run:
         return _run(run, paths, options)
 
 
@@ -107,7 +83,7 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> Jso
             found=", ".join(survey.paths[:3]),
             cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
         )
-    window = enclose(GridWindow(*job.record["window"]) for job in reduced)
+    window = GridWindow.union(GridWindow(*job.record["window"]) for job in reduced)
     size = options.resolution
     x0, y0, wide, tall = (number * size for number in window)
     cells = TileCells(options, survey.grid, survey.unit, window, {})
@@ -131,17 +107,7 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> Jso
             "points far from the others make the rasters this wide; if these are errors, mark them "
             "as noise (7)"
         )
-    write_rasters(paths, parts, window, size, survey.reference, RASTERS)
+    reference = survey.reference
+    write_rasters(paths, parts, window, size, reference.wkt, reference.units, RASTERS)
     shown = {name: str(path) for name, path in paths.items()}
     return {"files": shown, "width": window.width, "height": window.height, "known": known}
-
-
-def enclose(windows: Iterable[GridWindow]) -> GridWindow:
-    """Return the smallest window with all cells of windows, of which empty ones do not count."""
-    corners = [
-        ([w.left, w.left + w.width - 1], [w.bottom, w.bottom + w.height - 1])
-        for w in windows
-        if w.width
-    ]
-    columns, rows = np.array(corners).transpose(1, 0, 2)
-    return GridWindow.enclosing(columns, rows)

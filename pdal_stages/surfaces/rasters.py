@@ -18,7 +18,7 @@ from ..base.json_types import JsonObject
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.options import Box, TileGrid, touching
 from ..tiling.tile_records import Tile, cells_in_tile
-from .cells import EMPTY, STEPS, Integers, SurfaceOptions, lowest
+from .cells import EMPTY, HIGHEST, STEPS, Integers, SurfaceOptions, lowest
 from .triangulation import heights_at
 
 #: The rasters, and what they hold.
@@ -53,11 +53,10 @@ class TileCells:
 
     def near(self, box: Box) -> list[Tile]:
         """Return the tiles that share a point with a box, in steps."""
-        size = self.options.resolution
-        x0, y0, x1, y1 = (side / STEPS for side in box)
-        wide = x0 - size, y0 - size, x1 + size, y1 + size
+        west, south, east, north = (side / STEPS for side in box)
         tiles = [*self.files]
-        return [tiles[n] for n in touching([self.grid.box(tile) for tile in tiles], wide)]
+        boxes = [self.grid.box(tile, self.options.resolution) for tile in tiles]
+        return [tiles[n] for n in touching(boxes, (west, south, east, north))]
 
     def ground(self, loaded: dict[Tile, Integers], box: Box) -> Integers:
         """Return the ground points (n, 3) in a box, in steps, as triangles need them.
@@ -69,26 +68,21 @@ class TileCells:
         for tile in self.near(box):
             if tile not in loaded:
                 loaded[tile] = load_arrays(self.files[tile], ("ground",))["ground"]
-            # A cell that two tiles share is whole.
-            parts.append(
-                _inside(loaded[tile], (box[0] - side, box[1] - side, box[2] + side, box[3] + side))
-            )
-        return _inside(lowest(np.concatenate(parts), side), box)
+            parts.append(_inside(loaded[tile], box, side))  # a cell that two tiles share is whole
+        return _inside(lowest(np.concatenate(parts), side), box, 0.0)
 
     def highest(self, window: GridWindow) -> tuple[Integers, Integers]:
         """Return the arrays ``top`` and ``solid`` of a window of cells."""
         step = self.options.step
         low = window.left * step, window.bottom * step
         box = *low, low[0] + window.width * step, low[1] + window.height * step
-        out = tuple(np.full(window.shape, EMPTY) for _ in range(2))
-        for tile in self.near(box):
-            arrays = load_arrays(self.files[tile], ("window", "top", "solid"))
-            part = GridWindow(*arrays["window"].tolist())
-            both = window.intersect(part)
-            for raster, name in zip(out, ("top", "solid"), strict=True):
-                place = raster[both.slices_in(window)]
-                np.maximum(place, arrays[name][both.slices_in(part)], out=place)
-        return out[0], out[1]
+        files = [self.files[tile] for tile in self.near(box)]
+
+        def join(name: str) -> Integers:
+            parts = (load_arrays(file, (name, f"{name}_window")) for file in files)
+            return HIGHEST.join(name, parts, window)
+
+        return join("top"), join("solid")
 
 
 def compute_tile(cells: TileCells, tile: Tile, target: str) -> JsonObject:
@@ -121,14 +115,13 @@ def _terrain(cells: TileCells, window: GridWindow) -> Floats:
     step = cells.options.step
     x = (window.left + np.arange(window.width, dtype=float) + 0.5) * step
     y = (window.bottom + np.arange(window.height, dtype=float) + 0.5) * step
-    points_in = partial(cells.ground, {})
-    return heights_at((x, y), cells.reach * STEPS, cells.bounds, points_in) / STEPS
+    return heights_at((x, y), cells.reach * STEPS, cells.bounds, partial(cells.ground, {})) / STEPS
 
 
-def _inside(points: Integers, box: Box) -> Integers:
-    """Return the points (n, 3) in a box with its edges."""
-    x, y, _ = points.T
-    return points[(x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])]
+def _inside(points: Integers, box: Box, margin: float) -> Integers:
+    """Return the points (n, 3) in a box with its edges, grown by a margin."""
+    low, high = np.array(box[:2]) - margin, np.array(box[2:]) + margin
+    return points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)]
 
 
 def fill(

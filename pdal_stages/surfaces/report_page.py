@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
 from ..base.messages import count_of
 from ..reports import pictures
@@ -34,45 +33,40 @@ _SCALE_PART = 6
 _GPS_EPOCH = datetime.datetime(1980, 1, 6, tzinfo=datetime.timezone.utc)
 
 
-@dataclass
-class Rasters:
-    """Rasters of a survey: their windows, and (rows, columns) from the south."""
+def render_report(result: JsonObject, rules: ReportRules, cells: Mapping[str, NDArray]) -> str:
+    """Return the page.
 
-    rules: ReportRules
-    unit: float  #: meters per unit of the coordinates
-    of: dict[str, tuple[GridWindow, NDArray[np.int64]]]
-    strips: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 4), np.int64))
-    voids: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
-
-
-def render_report(result: JsonObject, rasters: Rasters) -> str:
-    """Return the page."""
-    top, side = rasters.of["picture"][1], rasters.rules.picture
+    `cells` are the rasters of :data:`.survey_cells.RASTERS`, (rows, columns) from the south, and
+    ``voids``: which cells of ``void`` are voids.
+    """
+    unit, top = rules.unit, cells["picture"]
     top = np.pad(top, 1, constant_values=EMPTY)  # a single row has no slope to be shaded
     away, at = ndimage.distance_transform_edt(top == EMPTY, return_indices=True)
     known, top = away < _GAP, top[tuple(at)]
-    z = np.where(known, (top >> 8) / STEPS, np.nan) * rasters.rules.vertical
-    relief = pictures.Surface(
-        0.0, 0.0, side * rasters.unit, np.where(known, 0, -1)[::-1], z[::-1], 1.0
-    )
+    z = np.where(known, (top >> 8) / STEPS, np.nan) * rules.vertical
+    which = np.where(known, 0, -1)[::-1]
+    relief = pictures.Surface(0.0, 0.0, rules.picture * unit, which, z[::-1], 1.0)
     light, codes = pictures.shading(relief), np.where(known, top & 255, 0)[::-1]
-    per_m2 = rasters.of["all"][1] / (rasters.rules.density * rasters.unit) ** 2
+    meters = rules.density * unit
+    per_m2 = cells["all"] / meters**2
     most = result["density"]["ordered"] or float(np.percentile(per_m2[per_m2 > 0], 90))
     density = pictures.ramp(np.where(per_m2 > 0, per_m2, np.nan), _DENSITY, (0.0, 2 * most))
-    held = np.where(rasters.of["void"][1] > 0, 235, 255)[..., None].repeat(3, axis=2)
-    held[rasters.voids > 0] = _VOID
-    meters = rasters.rules.density * rasters.unit
+    held = np.where(cells["void"] > 0, 235, 255)[..., None].repeat(3, axis=2)
+    held[cells["voids"] > 0] = _VOID
     each = f"Points a m2, cells of {meters:g} m: white 0, dark {2 * most:.3g}"
     heights, colors = pictures.ramp(relief.z, pictures.HEIGHT_COLORS), pictures.CLASS_COLORS[codes]
     views = [
         _view("Classes", pictures.paint(relief, colors, light), relief.pixel),
         _view("Heights", pictures.paint(relief, heights, light), relief.pixel),
         _view(each, density[::-1], meters),
-        _view("Voids: red", held[::-1].astype(np.uint8), rasters.rules.void * rasters.unit),
+        _view("Voids: red", held[::-1].astype(np.uint8), rules.void * unit),
     ]
-    if len(rasters.strips):
+    if result["strips"]:
         heading = f"Strips: RMS difference, blue 0, red {_LARGE:g} m"
-        views.append(_view(heading, _strips(rasters)[::-1], meters))
+        with np.errstate(invalid="ignore"):
+            rms = np.sqrt(cells["squares"] / cells["differing"]) * unit
+        colors = pictures.ramp(rms * (rules.vertical / STEPS), _DIFFERENCES, (0.0, _LARGE))
+        views.append(_view(heading, colors[::-1], meters))
     every = [(Path(path).name, described) for path, described in result["files"].items()]
     return render_page(
         "survey.html",
@@ -84,17 +78,6 @@ def render_report(result: JsonObject, rasters: Rasters) -> str:
         codes=[int(code) for code in result["survey"]["classes"]],
         time_span=_time_span(result["survey"]["times"]),
     )
-
-
-def _strips(rasters: Rasters) -> NDArray[np.uint8]:
-    """Return a picture of the RMS differences of strips in cells of density, from the south."""
-    window, points = rasters.of["all"]
-    column, row, squares, count = rasters.strips.T
-    index, shape = window.flat_index(column, row), points.size
-    total, cells = (np.bincount(index, v, shape).reshape(points.shape) for v in (squares, count))
-    scale = rasters.unit * rasters.rules.vertical / STEPS
-    with np.errstate(invalid="ignore"):
-        return pictures.ramp(np.sqrt(total / cells) * scale, _DIFFERENCES, (0.0, _LARGE))
 
 
 def _view(heading: str, colors: NDArray[np.uint8], pixel_m: float) -> JsonObject:

@@ -13,15 +13,21 @@ from numpy.typing import NDArray
 
 from ..base.asprs import OVERLAP, TERRAIN, WATER
 from ..base.distinct import DistinctPoints
-from ..base.grid import GridWindow, cell_numbers
+from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
 from ..tiling.inputs import LonePoints
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.tile_records import Part
-from .cells import EMPTY, STEPS, Integers, steps, usable
+from .cells import HIGHEST, STEPS, CellRule, Integers, cells_at, steps, usable
 
 #: Of points without times: a first time that is later than all.
 NEVER = 1e300
+_COUNT = CellRule(np.add, 0)
+#: Rasters of a survey.
+RASTERS = {
+    "all": _COUNT, "last": _COUNT, "void": CellRule(np.maximum, 0), "picture": HIGHEST,
+    "differing": _COUNT, "squares": _COUNT,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,11 +41,7 @@ class ReportRules:
     around_control: float = 10.0  #: ground points are kept within this distance of a control point
     max_slope: float = math.tan(math.radians(10.0))  #: steeper cells tell of shifts in x and y, too
     vertical: float = 1.0  #: unit of z / unit of x and y
-
-    @property
-    def sides(self) -> dict[str, float]:
-        """Return the sides of the cells of rasters, by their names."""
-        return {"density": self.density, "void": self.void, "picture": self.picture}
+    unit: float = 1.0  #: meters per unit of x and y
 
 
 def describe(part: Mapping[str, NDArray]) -> JsonObject:
@@ -88,7 +90,7 @@ def _is_last(part: Mapping[str, NDArray]) -> NDArray[np.bool_]:
     return part["ReturnNumber"] >= part["NumberOfReturns"]
 
 
-def reduce_for_report(
+def reduce_tile(
     parts: Sequence[Part], lone: LonePoints, rules: ReportRules, control: NDArray[np.float64]
 ) -> tuple[dict[str, NDArray], JsonObject]:
     """Reduce points of a tile: files and their dimensions.
@@ -96,120 +98,93 @@ def reduce_for_report(
     Returns
     -------
     arrays : dict
-        For each raster a ``*_window``, a :class:`GridWindow`, and (rows, columns) int64: ``all``
-        and ``last`` count points in cells of density; ``void`` is 0 without points, 2 with water,
-        else 1; ``picture`` is 256 x height in steps + class of the highest point. ``strips``
-        (k, 5) int64: source, column, row, sum of heights in steps, and number of ground points.
-        ``control`` (m, 3) int64: ground points near control points (c, 2), in steps.
-        Points that are not usable or come twice are left out.
+        Rasters as of :meth:`.cells.CellRule.rasterize`: ``all`` and ``last`` count points in cells
+        of density; ``void`` is 0 without points, 2 with water, else 1; ``picture`` is 256 x height
+        in steps + class of the highest point. ``strips`` (k, 5) int64: source, column, row, sum of
+        heights in steps, and number of ground points. ``control`` (m, 3) int64: ground points near
+        control points (c, 2), in steps. Points that are not usable or come twice are left out.
     figures : dict
         ``files``: see :func:`describe`; ``repeated``: points that come twice.
     """
-    columns, distinct = [], DistinctPoints()
+    columns, distinct = [np.empty((0, 6), np.int64)], DistinctPoints()
     for _, part in parts:
-        codes = part["Classification"]
         kept = usable(part, lone)
         kept &= distinct.first({**{axis: part[axis] for axis in "XYZ"}, "GpsTime": _times(part)})
-        xyz = [steps(part[name]) for name in "XYZ"]
-        more = codes, _is_last(part), part["PointSourceId"]
-        columns.append(np.column_stack([*xyz, *(np.asarray(v, np.int64) for v in more)])[kept])
-    points = np.concatenate([np.empty((0, 6), np.int64), *columns])
-    files = {path: describe(part) for path, part in parts}
-    figures = {"files": files, "repeated": distinct.repeated}
-    x, y, z, codes, last, source = points.T
+        xyz = (steps(part[name]) for name in "XYZ")
+        more = part["Classification"], _is_last(part), part["PointSourceId"]
+        columns.append(np.column_stack([*xyz, *more]).astype(np.int64)[kept])
+    points = np.concatenate(columns)
+    z, codes, last, source = points[:, 2:].T
     values = {
-        "all": ("density", np.add, 1, 0),
-        "last": ("density", np.add, last, 0),
-        "void": ("void", np.maximum, np.where(codes == WATER, 2, 1), 0),
-        "picture": ("picture", np.maximum, 256 * z + codes, EMPTY),
+        "all": (rules.density, 0 * z + 1),
+        "last": (rules.density, last),
+        "void": (rules.void, np.where(codes == WATER, 2, 1)),
+        "picture": (rules.picture, 256 * z + codes),
     }
     arrays: dict[str, NDArray] = {}
-    for name, (cells, merge, value, empty) in values.items():
-        window, cell = _cells(x, y, rules.sides[cells])
-        raster = np.full(window.width * window.height, empty)
-        merge.at(raster, cell, value)
-        arrays |= {name: raster.reshape(window.shape), f"{name}_window": np.array(window)}
-    ground = np.isin(codes, TERRAIN)
-    window, cell = _cells(x[ground], y[ground], rules.strip)
-    size = max(1, window.width * window.height)
-    both = source[ground] * size + cell
-    key, which, count = np.unique(both, return_inverse=True, return_counts=True)
-    sums = np.zeros(len(key), np.int64)
-    np.add.at(sums, which, z[ground])
-    row, column = np.divmod(key % size, max(1, window.width))
-    near = np.zeros(np.count_nonzero(ground), bool)
+    for name, (side, value) in values.items():
+        arrays |= RASTERS[name].rasterize(name, cells_at(points, side * STEPS), value)
+    is_ground = np.isin(codes, TERRAIN)
+    ground = points[is_ground, :3]
+    keys = np.column_stack([source[is_ground], *cells_at(ground, rules.strip * STEPS)])
+    near = np.zeros(len(ground), bool)
     for place in control * STEPS:
-        near |= np.hypot(x[ground] - place[0], y[ground] - place[1]) <= rules.around_control * STEPS
-    places = key // size, column + window.left, row + window.bottom
-    arrays["strips"] = np.column_stack([*places, sums, count])
-    arrays["control"] = points[ground][near][:, :3]
-    return arrays, figures
+        near |= np.hypot(*(ground[:, :2] - place).T) <= rules.around_control * STEPS
+    arrays["strips"] = sum_up(keys, ground[:, 2])
+    arrays["control"] = ground[near]
+    figures = {"files": {path: describe(part) for path, part in parts}}
+    return arrays, {**figures, "repeated": distinct.repeated}
 
 
-def _numbers(x: Integers, y: Integers, side: float) -> tuple[Integers, Integers]:
-    """Return columns and rows of cells of places in steps."""
-    column, row = (cell_numbers(values.astype(float), side * STEPS) for values in (x, y))
-    return column, row
-
-
-def _cells(x: Integers, y: Integers, side: float) -> tuple[GridWindow, Integers]:
-    """Return the window of the cells of places, and the index of each place in it."""
-    if not len(x):
-        return GridWindow(0, 0, 0, 0), np.empty(0, np.int64)
-    column, row = _numbers(x, y, side)
-    window = GridWindow.enclosing(column, row)
-    return window, window.flat_index(column, row)
+def sum_up(keys: Integers, values: Integers) -> Integers:
+    """Return rows of keys (n, k), each once, ascending, with the sum and number of its values."""
+    order = np.lexsort(keys.T[::-1])
+    keys, first = keys[order], np.ones(len(keys), bool)
+    first[1:] = (keys[1:] != keys[:-1]).any(axis=1)
+    start = np.flatnonzero(first)
+    total = np.add.reduceat(values[order], start)
+    return np.column_stack([keys[start], total, np.diff(start, append=len(keys))])
 
 
 def compare_strips(files: list[str], window: GridWindow, rules: ReportRules, target: str) -> dict:
     """Compare the ground of strips in a window of cells; save and return what differs.
 
     The arrays are ``differences`` (k, 4) int64: a source, a greater one, the greater one's mean
-    height minus the other's in steps, and the number of cells; ``cells`` (m, 4): column and row of
-    a cell of density, sum of squares, and number of differences.
+    height minus the other's in steps, and the number of cells; and, in cells of density, rasters as
+    of :meth:`.cells.CellRule.rasterize`: ``differing``, how many there are, and ``squares``, the
+    sum of theirs.
     """
     rows = np.concatenate([load_arrays(name, ("strips",))["strips"] for name in files])
     rows = rows[window.padded(1).contains(rows[:, 1], rows[:, 2])]
-    held = GridWindow.enclosing(rows[:, 1], rows[:, 2]) if len(rows) else GridWindow(0, 0, 0, 0)
-    window = window.intersect(held)  # a tile may be much wider than its points
-    around = window.padded(1)
-    rows = rows[around.contains(rows[:, 1], rows[:, 2])]
-    cell = around.flat_index(rows[:, 1], rows[:, 2])
-    mean = _means(rows, cell, around)
-    slope = np.hypot(*np.gradient(mean / STEPS, rules.strip)) * rules.vertical
-    inner = window.slices_in(around)
+    # A tile may be much wider than its points.
+    window = window.intersect(GridWindow.enclosing(rows[:, 1], rows[:, 2]))
+    surroundings = window.padded(1)
+    rows = rows[surroundings.contains(rows[:, 1], rows[:, 2])]
+
+    def means(chosen: Integers) -> NDArray[np.float64]:
+        """Return mean heights of cells in steps, NaN for none."""
+        cell = surroundings.flat_index(chosen[:, 1], chosen[:, 2])
+        size = surroundings.width * surroundings.height
+        total, count = (np.bincount(cell, chosen[:, k], size) for k in (3, 4))
+        with np.errstate(invalid="ignore"):
+            return (total / count).reshape(surroundings.shape)
+
+    inner = window.slices_in(surroundings)
+    slope = np.hypot(*np.gradient(means(rows) / STEPS, rules.strip)) * rules.vertical
     flat = (slope <= rules.max_slope)[inner]
-    sources = np.unique(rows[:, 0]).tolist()
-    chosen = {source: rows[:, 0] == source for source in sources}
-    of_source = {s: _means(rows[own], cell[own], around)[inner] for s, own in chosen.items()}
-    differences, cells = [np.empty((0, 4), np.int64)], [np.empty((0, 4), np.int64)]
-    for a, b in combinations(sources, 2):
-        both = of_source[b] - of_source[a]
-        row, column = np.nonzero(np.isfinite(both) & flat)
-        if len(row):
-            value = np.rint(both[row, column]).astype(np.int64)
-            number, count = np.unique(value, return_counts=True)
-            differences.append(np.column_stack([0 * number + a, 0 * number + b, number, count]))
-            places = column + window.left, row + window.bottom
-            x, y = (steps((number + 0.5) * rules.strip) for number in places)
-            at = np.column_stack(_numbers(x, y, rules.density))
-            cells.append(np.column_stack([at, value**2, 0 * value + 1]))
-    arrays = {"differences": _sum_up(differences, 3), "cells": _sum_up(cells, 2)}
+    by_source = {s: means(rows[rows[:, 0] == s])[inner] for s in np.unique(rows[:, 0]).tolist()}
+    columns = [np.empty((0, 5), np.int64)]
+    for (a, lower), (b, upper) in combinations(by_source.items(), 2):
+        difference = upper - lower
+        row, column = np.nonzero(np.isfinite(difference) & flat)
+        value = np.rint(difference[row, column]).astype(np.int64)
+        at = column + window.left, row + window.bottom
+        columns.append(np.column_stack([0 * row + a, 0 * row + b, value, *at]))
+    rows = np.concatenate(columns)
+    value, centers = rows[:, 2], steps((rows[:, 3:] + 0.5) * rules.strip)
+    cells = cells_at(centers, rules.density * STEPS)
+    arrays = {"differences": sum_up(rows[:, :3], 0 * value)[:, [0, 1, 2, 4]]}
+    arrays |= RASTERS["differing"].rasterize("differing", cells, 0 * value + 1)
+    arrays |= RASTERS["squares"].rasterize("squares", cells, value**2)
     save_arrays(target, arrays)
-    return {"cells": int(arrays["differences"][:, 3].sum())}
-
-
-def _means(rows: Integers, cell: Integers, window: GridWindow) -> NDArray[np.float64]:
-    """Return mean heights of cells in steps, NaN for none."""
-    total, count = (np.bincount(cell, rows[:, k], window.width * window.height) for k in (3, 4))
-    with np.errstate(invalid="ignore"):
-        return (total / count).reshape(window.shape)
-
-
-def _sum_up(parts: Sequence[Integers], keys: int) -> Integers:
-    """Return rows with each combination of the first columns once, and the others added."""
-    rows = np.concatenate(parts)
-    unique, which = np.unique(rows[:, :keys], axis=0, return_inverse=True)
-    sums = np.zeros((len(unique), rows.shape[1] - keys), np.int64)
-    np.add.at(sums, which.reshape(-1), rows[:, keys:])
-    return np.column_stack([unique, sums])
+    return {"cells": len(rows)}

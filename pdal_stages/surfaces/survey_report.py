@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,24 +23,20 @@ from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.jobs import Job
 from ..tiling.options import TilingOptions
-from ..tiling.tile_records import RecordRun, Tile, cells_in_tile, record_run
-from .cells import EMPTY, STEPS, SurfaceOptions, lowest
-from .make_surfaces import CellSurvey, enclose
-from .report_page import Rasters, render_report
-from .survey_cells import ReportRules, combine, compare_strips, figures_of, reduce_for_report
+from ..tiling.tile_records import RecordRun, RecordSurvey, Tile, cells_in_tile, record_run
+from .cells import STEPS, CellDensity, SurfaceOptions, lowest
+from .report_page import render_report
+from .survey_cells import RASTERS, ReportRules, combine, compare_strips, figures_of, reduce_tile
 from .triangulation import Box, heights_at
 
 #: Width of pictures in pixels, and voids and control points that are listed, as many as fit a page.
 _WIDTH, _LISTED = 820, 10
 #: NSSDA: 95 % of normally distributed errors are smaller than this times their RMSE.
 NSSDA = 1.96
-#: How rasters of tiles become one, and what a cell without points holds.
-_MERGES = {
-    "all": (np.add, 0), "last": (np.add, 0),
-    "void": (np.maximum, 0), "picture": (np.maximum, EMPTY),
-}  # fmt: skip
 #: x, y, z and name of a control point.
 Control = tuple[float, float, float, str]
+#: Cells, and their values (rows, columns) from the south.
+WindowCells = tuple[GridWindow, NDArray[np.int64]]
 
 
 def write_report(
@@ -80,11 +76,11 @@ def write_report(
     outputs = [Output(page, "report", HTML)] + [Output(json_file, "json", JSON)] * bool(json_file)
     files = input_files(inputs)
     check_outputs(outputs, [*files, *([control] if control else [])])
-    chosen, folder = replace(tiling or TilingOptions(), per="tile"), Path(page).absolute().parent
-    survey = CellSurvey("report", files, folder, chosen, SurfaceOptions())
-    with record_run(survey, chosen, folder, progress) as run:
-        result, rasters = _measure(run, density, void, points)
-    write_whole(page, render_report(result, rasters).encode(errors="backslashreplace"), "report")
+    measure = partial(CellDensity.with_cells, SurfaceOptions())
+    survey = RecordSurvey("report", files, Path(page).absolute().parent, tiling, measure)
+    with record_run(survey, progress) as run:
+        result, text = _measure(run, density, void, points)
+    write_whole(page, text.encode(errors="backslashreplace"), "report")
     if json_file:
         write_json(json_file, result, "json")
     return result
@@ -93,16 +89,13 @@ def write_report(
 def read_control(path: str) -> list[Control]:
     """Return the control points of a CSV file: x, y, z and a name, with or without a heading."""
     rows = read_point_rows(path, "control point", needs_z=True)
-    numbered = enumerate(rows, 1)
-    return [
-        (row.x, row.y, float(row.z or 0.0), row.name or str(number)) for number, row in numbered
-    ]
+    return [(r.x, r.y, float(r.z or 0.0), r.name or str(n)) for n, r in enumerate(rows, 1)]
 
 
 def _measure(
     run: RecordRun, ordered: float, void: float, control: Sequence[Control]
-) -> tuple[JsonObject, Rasters]:
-    """Reduce all tiles; return the figures, and rasters to draw."""
+) -> tuple[JsonObject, str]:
+    """Reduce all tiles; return the figures and the page."""
     survey, unit = run.survey, run.survey.unit
     units = survey.reference.units
     run.read_inputs()
@@ -114,17 +107,24 @@ def _measure(
         picture=max(max(x1 - x0, y1 - y0) / _WIDTH, 2.0 / math.sqrt(survey.density.each)),
         around_control=10.0 / unit,
         vertical=units.vertical / units.horizontal,
+        unit=unit,
     )
     places = np.array([point[:2] for point in control]).reshape(-1, 2)
     settings = {**asdict(rules), "places": places.tolist()}
-    reduce = partial(reduce_for_report, rules=rules, control=places)
+    reduce = partial(reduce_tile, rules=rules, control=places)
     jobs = run.reduce("report", settings, reduce)
     files: dict[str, list[Any]] = {}
     for path, described in (item for job in jobs for item in job.record["files"].items()):
         files.setdefault(path, []).append(described)
     by_file = {path: combine(files[path]) for path in survey.paths if path in files}
-    rasters = Rasters(rules, unit, {name: _merge(run, jobs, name) for name in _MERGES})
-    strips, rasters.strips = _strips(run, jobs, rules, units.vertical)
+    whole = {name: _merge(run, jobs, name) for name in ("all", "last", "void", "picture")}
+    compared = _compare_strips(run, jobs, rules)
+    for name in ("differing", "squares"):
+        whole[name] = _merge(run, compared, name, whole["all"][0])
+    if not whole["all"][1].any():
+        raise StageError("no point is neither noise nor withheld", found=survey.paths[0])
+    figures, is_void = _density(whole, rules, ordered)
+    cells = {name: values for name, (_, values) in whole.items()} | {"voids": is_void}
     result = {
         "version": __version__,
         "reference": survey.reference.name,
@@ -132,85 +132,82 @@ def _measure(
         "survey": figures_of(combine([*by_file.values()])),
         "files": {path: figures_of(described) for path, described in by_file.items()},
         "repeated": sum(job.record["repeated"] for job in jobs),
-        **_density(rasters, ordered),
-        "strips": strips,
+        **figures,
+        "strips": _strips(run, compared, units.vertical),
         "control": _control(run, jobs, control, rules, units.vertical) if control else None,
     }
-    return result, rasters
+    return result, render_report(result, rules, cells)
 
 
-def _merge(run: RecordRun, jobs: Sequence[Job], name: str) -> tuple[GridWindow, NDArray[np.int64]]:
-    """Return a raster of all tiles."""
-    merge, empty = _MERGES[name]
-    loaded = run.arrays(jobs, name, f"{name}_window")
-    windows = [GridWindow(*arrays[f"{name}_window"].tolist()) for arrays in loaded]
-    if not any(w.width for w in windows):
-        raise StageError("no point is neither noise nor withheld", found=run.survey.paths[0])
-    whole = enclose(windows)
-    out = np.full(whole.shape, empty)
-    for window, arrays in zip(windows, loaded, strict=True):
-        if window.width:
-            place = out[window.slices_in(whole)]
-            merge(place, arrays[name], out=place)
-    return whole, out
+def _merge(
+    run: RecordRun, jobs: Sequence[Job], name: str, window: GridWindow | None = None
+) -> WindowCells:
+    """Return a raster of all tiles, and its window, if none is given that of their cells."""
+    if window is None:
+        each = run.arrays(jobs, f"{name}_window")
+        window = GridWindow.union(GridWindow(*arrays[f"{name}_window"].tolist()) for arrays in each)
+    parts = run.arrays(jobs, name, f"{name}_window")
+    return window, RASTERS[name].join(name, parts, window)
 
 
-def _density(rasters: Rasters, ordered: float) -> JsonObject:
-    """Return figures of density and voids.
+def _density(
+    rasters: Mapping[str, WindowCells], rules: ReportRules, ordered: float
+) -> tuple[JsonObject, NDArray[np.bool_]]:
+    """Return figures of density and voids, and which cells are voids.
 
     A cell of density counts if it and its eight neighbors have points, as those at the border are
     filled in part. A void is a group of cells without points that others enclose; it is water if
     half of the cells with points around it or more are.
     """
-    side_m, cell_m = rasters.rules.density * rasters.unit, rasters.rules.void * rasters.unit
-    (_, all_points), (_, last) = rasters.of["all"], rasters.of["last"]
-    inner = ndimage.minimum_filter(all_points > 0, 3, mode="constant")
-    window, held = rasters.of["void"]
-    inside = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(held > 0, 2), iterations=2))
-    inside = inside[2:-2, 2:-2] | (held > 0)
+    side_m, cell_m = rules.density * rules.unit, rules.void * rules.unit
+    inner = ndimage.minimum_filter(rasters["all"][1] > 0, 3, mode="constant")
+    window, held = rasters["void"]
+    closed = ndimage.binary_closing(np.pad(held > 0, 2), iterations=2)
+    inside = ndimage.binary_fill_holes(closed)[2:-2, 2:-2] | (held > 0)
     label, count = ndimage.label(inside & (held == 0), np.ones((3, 3)))
     area = float(inside.sum() * cell_m**2)
     density: JsonObject = {"cell_m": side_m, "cells": int(inner.sum()), "ordered": ordered}
-    for name, points in (("all", all_points), ("last", last)):
+    for name in ("all", "last"):
+        points = rasters[name][1]
         each = points[inner] / side_m**2
-        known, judged = len(each) > 0, ordered > 0 and len(each) > 0
         density[name] = {
             "mean": float(points.sum() / area),
-            "median": float(np.median(each)) if known else None,
-            "share_below": float((each < ordered).mean()) if judged else None,
+            "median": float(np.median(each)) if len(each) else None,
+            "share_below": float((each < ordered).mean()) if ordered and len(each) else None,
         }
     # Cells with points beside a void, by its number, and how many of them are water.
     beside = np.where(held > 0, ndimage.maximum_filter(label, 3), 0)
     around, water = (np.bincount(beside[held >= least], minlength=count + 1) for least in (1, 2))
     is_void = 2 * water < np.maximum(around, 1)
     is_void[0] = False
-    rasters.voids = is_void[label]
-    sizes = np.bincount(label[rasters.voids], minlength=count + 1) * cell_m**2
+    sizes = np.bincount(label.ravel(), minlength=count + 1)[is_void] * cell_m**2
     middles = ndimage.center_of_mass(label > 0, label, np.flatnonzero(is_void))
-    voids: list[JsonObject] = []
-    for area_m2, (row, column) in zip(sizes[is_void], middles, strict=True):
-        cell = window.left + column, window.bottom + row
-        at = [round((number + 0.5) * rasters.rules.void, 2) for number in cell]
-        voids.append({"area_m2": float(area_m2), "at": at})
+    corner = window.bottom + 0.5, window.left + 0.5
+    places = (np.reshape(middles, (-1, 2)) + corner) * rules.void
+    voids: list[JsonObject] = [
+        {"area_m2": size, "at": [round(x, 2), round(y, 2)]}
+        for size, (y, x) in zip(sizes.tolist(), places.tolist(), strict=True)
+    ]
     voids.sort(key=lambda each: (-each["area_m2"], each["at"]))
     total = float(sizes.sum())
     figures = {"cell_m2": cell_m**2, "count": len(voids), "area_m2": total, "share": total / area}
-    return {"area_m2": area, "density": density, "voids": {**figures, "largest": voids[:_LISTED]}}
+    listed = {**figures, "largest": voids[:_LISTED]}
+    return {"area_m2": area, "density": density, "voids": listed}, is_void[label]
 
 
-def _strips(
-    run: RecordRun, jobs: Sequence[Job], rules: ReportRules, vertical: float
-) -> tuple[list[JsonObject], NDArray[np.int64]]:
-    """Compare the ground of strips; return pairs, worst first, and cells of density with errors."""
+def _compare_strips(run: RecordRun, jobs: Sequence[Job], rules: ReportRules) -> list[Job]:
+    """Compare the ground of strips in all tiles; return the jobs."""
 
     def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Any]:
         window = cells_in_tile(run.survey.grid, tile, rules.strip)
         return partial(compare_strips, [*files.values()], window, rules, target)
 
-    tiles = [job.tile for job in jobs]
-    compared = run.compute("strips", jobs, tiles, 2 * rules.strip, compute)
-    loaded = run.arrays(compared, "differences", "cells")
-    rows = np.concatenate([arrays["differences"] for arrays in loaded])
+    return run.compute("strips", jobs, [job.tile for job in jobs], 2 * rules.strip, compute)
+
+
+def _strips(run: RecordRun, compared: Sequence[Job], vertical: float) -> list[JsonObject]:
+    """Return how pairs of strips differ, worst first."""
+    rows = np.concatenate([each["differences"] for each in run.arrays(compared, "differences")])
     pairs: list[JsonObject] = []
     for a, b in np.unique(rows[:, :2], axis=0).tolist():
         value, count = rows[(rows[:, 0] == a) & (rows[:, 1] == b)][:, 2:].T
@@ -220,8 +217,7 @@ def _strips(
         values = {"median_m": float(value[order][middle]), "rms_m": rms}
         in_meters = {name: value * vertical / STEPS for name, value in values.items()}
         pairs.append({"strips": [a, b], "cells": int(count.sum()), **in_meters})
-    pairs.sort(key=lambda pair: (-pair["rms_m"], pair["strips"]))
-    return pairs, np.concatenate([arrays["cells"] for arrays in loaded])
+    return sorted(pairs, key=lambda pair: (-pair["rms_m"], pair["strips"]))
 
 
 def _control(
@@ -232,8 +228,8 @@ def _control(
     vertical: float,
 ) -> JsonObject:
     """Compare the terrain, through all ground points, with control points."""
-    near_any = [arrays["control"] for arrays in run.arrays(jobs, "control")]
-    ground = lowest(np.concatenate(near_any), 1.0)  # one of points at the same place
+    near_any = np.concatenate([each["control"] for each in run.arrays(jobs, "control")])
+    ground = lowest(near_any, 1.0)  # one of points at the same place
     reach, everywhere = rules.around_control * STEPS, (math.inf, math.inf, -math.inf, -math.inf)
     rows: list[JsonObject] = []
     outside = []
@@ -241,11 +237,11 @@ def _control(
         place = np.array([x, y]) * STEPS
         near = ground[np.hypot(*(ground[:, :2] - place).T) <= reach]
         height = heights_at((place[:1], place[1:]), reach, everywhere, partial(_all_of, near))
-        if np.isfinite(height[0, 0]):
-            difference = (height[0, 0] / STEPS - z) * vertical
-            rows.append({"name": name, "x": x, "y": y, "z": z, "difference_m": float(difference)})
-        else:
+        difference = float((height[0, 0] / STEPS - z) * vertical)
+        if math.isnan(difference):
             outside.append(name)
+        else:
+            rows.append({"name": name, "x": x, "y": y, "z": z, "difference_m": difference})
     errors = np.array([row["difference_m"] for row in rows])
     rows.sort(key=lambda row: -abs(row["difference_m"]))
     out: JsonObject = {"points": len(rows), "outside": outside, "worst": rows[:_LISTED]}

@@ -173,9 +173,8 @@ def heights_at(
     if distance < reach and np.isfinite([low, high]).any():
         step = x[1] - x[0] if len(x) > 1 else reach
         widest = widest or max(box[2] - box[0], box[3] - box[1])
-        split = partial(
-            _groups, width=2 * int(distance / step) + 1, most=_room(widest, reach) / step
-        )
+        room = widest - 2 * reach if widest >= SPLIT * reach else math.inf
+        split = partial(_groups, width=2 * int(distance / step) + 1, most=room / step)
         for rows, columns in split(is_open):
             part = x[columns], y[rows]
             is_open[rows, columns] &= _in_hull(part, points_in(_around(part, reach)))
@@ -183,11 +182,6 @@ def heights_at(
             part, farther = (x[columns], y[rows]), min(3 * distance, reach)
             out[rows, columns] = heights_at(part, reach, bounds, points_in, farther, widest)
     return out
-
-
-def _room(widest: float, reach: float) -> float:
-    """Return how wide a piece may be that lies with `reach` around it in the widest box."""
-    return widest - 2 * reach if widest >= SPLIT * reach else math.inf
 
 
 def _around(centers: tuple[NDArray[np.float64], NDArray[np.float64]], distance: float) -> Box:
@@ -202,15 +196,13 @@ def _groups(mask: NDArray[np.bool_], width: int, most: float) -> Iterator[tuple[
     Those within a width of each other are in one, or in neighbors that were cut.
     """
     label = np.where(mask, ndimage.label(ndimage.maximum_filter(mask, width))[0], 0)
+    each = max(1, int(min(most, max(mask.shape))))
     for box in ndimage.find_objects(label):
-        sides = []
-        for side in box:
-            each = max(1, int(min(most, side.stop - side.start)))
-            starts = range(side.start, side.stop, each)
-            sides.append([slice(start, min(start + each, side.stop)) for start in starts])
-        yield from (
-            (rows, columns) for rows, columns in product(*sides) if mask[rows, columns].any()
-        )
+        for corner in product(*(range(side.start, side.stop, each) for side in box)):
+            ends = (min(at + each, side.stop) for at, side in zip(corner, box, strict=True))
+            rows, columns = map(slice, corner, ends)
+            if mask[rows, columns].any():
+                yield rows, columns
 
 
 def _in_hull(

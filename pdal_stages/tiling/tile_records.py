@@ -27,7 +27,7 @@ from ..base.messages import count_of, print_messages
 from ..base.version import build
 from .inputs import LONE_M, InputSource, LonePoints, Survey
 from .jobs import Job, Store, load_arrays, save_arrays
-from .options import TileGrid, TilingOptions
+from .options import Density, TileGrid, TilingOptions
 from .plan import TilePlan
 from .rounds import Round
 from .sorted_points import points_near
@@ -43,26 +43,54 @@ Tile = tuple[int, int]
 #: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
 #: writes it to a file, and returns figures.
 Compute = Callable[[Tile, dict[Tile, str], str], Callable[[], Any]]
+#: Returns the density by which tiles are chosen, from that of points and meters per unit.
+Measure = Callable[[Density, float], Density]
 #: Reasons that are shown where tiles fail.
 _MOST_REASONS = 3
 
 
-def plan_of_records(name: str, files: Sequence[str]) -> TilePlan:
-    """Return a plan without stages: inputs must have one reference, and nothing lies around."""
-    reader = {"type": "readers.las", "filename": list(files)}
-    return TilePlan(
-        readers=[reader],
-        in_tiles=[],
-        rounds=[Round(0, 0, [], 0.0)],
-        per_output=[],
-        files=[],
-        sees_m=0.0,
-        one_reference=True,
-        creates=[],
-        unit="",
-        messages=[],
-        name=name,
-    )
+class RecordSurvey(Survey):
+    """A survey whose tiles are reduced to records: inputs have one reference, nothing lies around.
+
+    Its outputs lie in a folder.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        files: Sequence[str],
+        folder: Path,
+        tiling: TilingOptions | None,
+        measure: Measure,
+    ) -> None:
+        """Find and check the inputs, and choose tiles by a measure of their density.
+
+        A run that resumes another has its tiles, where the user gives no size.
+        """
+        reader = {"type": "readers.las", "filename": list(files)}
+        plan = TilePlan(
+            readers=[reader],
+            in_tiles=[],
+            rounds=[Round(0, 0, [], 0.0)],
+            per_output=[],
+            files=[],
+            sees_m=0.0,
+            one_reference=True,
+            creates=[],
+            unit="",
+            messages=[],
+            name=name,
+        )
+        self.folder, self._measure = folder, measure
+        self.chosen = replace(tiling or TilingOptions(), per="tile")  #: as the user gives them
+        known = {}
+        if self.chosen.resume and self.chosen.tile is None:
+            known = Store(folder).note("run")
+        super().__init__(plan, self.chosen, known if "square" in known else None)
+
+    def measure_density(self) -> Density:
+        """Return the density by which tiles are chosen."""
+        return self._measure(super().measure_density(), self.unit)
 
 
 class RecordRun(SurveyRun):
@@ -132,9 +160,9 @@ class RecordRun(SurveyRun):
         """Return the file of a job's arrays."""
         return self.store.path(job.name)
 
-    def arrays(self, jobs: Sequence[Job], *names: str) -> list[dict[str, NDArray]]:
-        """Return arrays of jobs."""
-        return [load_arrays(self.path_of(job), names) for job in jobs]
+    def arrays(self, jobs: Iterable[Job], *names: str) -> Iterator[dict[str, NDArray]]:
+        """Yield arrays of jobs, those of one at a time."""
+        return (load_arrays(self.path_of(job), names) for job in jobs)
 
     def _jobs(self, name: str, points: Mapping[Tile, int], marks: Mapping[Tile, Any]) -> list[Job]:
         """Return jobs for tiles with their numbers of points, and with what affects each."""
@@ -163,18 +191,16 @@ class RecordRun(SurveyRun):
 
 
 @contextlib.contextmanager
-def record_run(
-    survey: Survey, chosen: TilingOptions, folder: Path, progress: bool | None = None
-) -> Iterator[RecordRun]:
-    """Open the working folder and the workers of a run whose outputs lie in a folder."""
+def record_run(survey: RecordSurvey, progress: bool | None = None) -> Iterator[RecordRun]:
+    """Open the working folder and the workers of a run."""
     if not survey.density.points:
         raise StageError("the inputs have no points", found=", ".join(survey.paths[:3]))
     print_messages(*survey.messages)
+    chosen, options = survey.chosen, survey.options
     alone = chosen.tile is None and len(survey.grid.covering(survey.bounds)) == 1
-    options = survey.options
     if alone and chosen.workers is None and not chosen.scheduler:
         options = replace(options, workers=0)  # another process would take longer to start
-    with Store(folder) as store:
+    with Store(survey.folder) as store:
         if not chosen.resume:
             store.clear()
         store.finish("run", "", survey.layout)
@@ -183,12 +209,6 @@ def record_run(
         store.remove(".npz")
     if changed := survey.changed():
         print_messages(f"{changed[0]} changed during the run: run it again")
-
-
-def earlier_layout(folder: Path, chosen: TilingOptions) -> JsonObject | None:
-    """Return the tiles of the run that this one resumes, where the user gives no size."""
-    known = Store(folder).note("run") if chosen.resume and chosen.tile is None else {}
-    return known if "square" in known else None
 
 
 def cells_in_tile(grid: TileGrid, tile: Tile, side: float) -> GridWindow:
@@ -200,7 +220,7 @@ def cells_in_tile(grid: TileGrid, tile: Tile, side: float) -> GridWindow:
     for number, low in zip(tile, grid.box(tile)[:2], strict=True):
         cells = math.floor(low / side) - 1 + np.arange(math.ceil(grid.size / side) + 3.0)
         sides.append(cells[grid.index((cells + 0.5) * side) == number].astype(np.int64))
-    return GridWindow.enclosing(*sides) if all(map(len, sides)) else GridWindow(0, 0, 0, 0)
+    return GridWindow.enclosing(*sides)
 
 
 def _reduce_tile(
