@@ -380,6 +380,7 @@ def test_a_few_points_far_away_make_rasters_wide_and_a_message_says_so(survey, t
     result = write_surfaces([cloud], str(tmp_path / "out"), SurfaceOptions(), progress=False)
     said = capsys.readouterr().err
     assert "cells have a height: points far from the others" in said and "left out" not in said
+    assert f"as near 509000 {np.floor(far[:, 1].min()):.0f} of {cloud}" in said
     assert result["width"] > 9_000
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -102,12 +103,17 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> Jso
 
     known = {name: sum(job.record[name] for job in jobs) for name in RASTERS}
     if (share := known["surface"] / (window.width * window.height)) < _NEARLY_EMPTY:
+        held = [job for job in reduced if job.record["window"][2]]
+        fullest = max(held, key=lambda job: job.points)
+        far = max(held, key=lambda job: math.dist(job.tile, fullest.tile))
+        file = survey.near(far.tile, 0.0)[0].path
+        x, y = (number * size for number in far.record["window"][:2])
         print_messages(
             f"{100 * share:.2g} % of {window.width:,} x {window.height:,} cells have a height: "
-            "points far from the others make the rasters this wide; if these are errors, mark them "
-            "as noise (7)"
+            f"points far from the others, as near {x:.0f} {y:.0f} of {file}, make the rasters this "
+            "wide; if these are errors, mark them as noise (7)"
         )
-    reference = survey.reference
-    write_rasters(paths, parts, window, size, reference.wkt, reference.units, RASTERS)
+    wkt, units = survey.reference.wkt, survey.reference.units
+    write_rasters(paths, parts, window, size, wkt, units, RASTERS)
     shown = {name: str(path) for name, path in paths.items()}
     return {"files": shown, "width": window.width, "height": window.height, "known": known}

@@ -54,9 +54,8 @@ class TileCells:
     def near(self, box: Box) -> list[Tile]:
         """Return the tiles that share a point with a box, in steps."""
         west, south, east, north = (side / STEPS for side in box)
-        tiles = [*self.files]
-        boxes = [self.grid.box(tile, self.options.resolution) for tile in tiles]
-        return [tiles[n] for n in touching(boxes, (west, south, east, north))]
+        boxes = [self.grid.box(tile, self.options.resolution) for tile in self.files]
+        return [[*self.files][n] for n in touching(boxes, (west, south, east, north))]
 
     def ground(self, loaded: dict[Tile, Integers], box: Box) -> Integers:
         """Return the ground points (n, 3) in a box, in steps, as triangles need them.

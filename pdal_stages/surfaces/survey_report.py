@@ -96,18 +96,17 @@ def _measure(
     run: RecordRun, ordered: float, void: float, control: Sequence[Control]
 ) -> tuple[JsonObject, str]:
     """Reduce all tiles; return the figures and the page."""
-    survey, unit = run.survey, run.survey.unit
-    units = survey.reference.units
+    survey, units = run.survey, run.survey.reference.units
     run.read_inputs()
     x0, y0, x1, y1 = survey.find_lone_points().others
     rules = ReportRules(
-        density=10.0 / unit,
-        void=math.sqrt(void) / unit,
-        strip=1.0 / unit,
+        density=10.0 / units.horizontal,
+        void=math.sqrt(void) / units.horizontal,
+        strip=1.0 / units.horizontal,
         picture=max(max(x1 - x0, y1 - y0) / _WIDTH, 2.0 / math.sqrt(survey.density.each)),
-        around_control=10.0 / unit,
+        around_control=10.0 / units.horizontal,
         vertical=units.vertical / units.horizontal,
-        unit=unit,
+        unit=units.horizontal,
     )
     places = np.array([point[:2] for point in control]).reshape(-1, 2)
     settings = {**asdict(rules), "places": places.tolist()}
