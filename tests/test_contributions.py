@@ -59,11 +59,15 @@ def observed():
         where, seen = np.zeros(len(xyz), bool), {}
         where[[5, 77, 1234, 3001]] = True
 
-        def observe(inputs):
-            if len(inputs.rows):
-                seen.setdefault(inputs.number, []).append(inputs)
+        class Observer:
+            def see_inputs(self, inputs):
+                if len(inputs.rows):
+                    seen.setdefault(inputs.number, []).append(inputs)
 
-        model.predict(xyz, dimensions, where, observe=observe)
+            def see_classes(self, step, codes, least=None):
+                assert len(codes) == len(xyz)
+
+        model.predict(xyz, dimensions, where, observer=Observer())
         parts = [[*zip(*seen[number], strict=True)][1:] for number in range(len(model.passes))]
         return [
             (single, *map(np.concatenate, part))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from functools import cache
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
@@ -61,6 +62,30 @@ class PassInputs(NamedTuple):
 
 #: Receives what passes read.
 Observe = Callable[[PassInputs], None]
+
+
+class ClassStep(Enum):
+    """Steps in which classified points get their class, in this order."""
+
+    LIKELIEST = 1
+    GIVEN_GROUND = 2  #: what is too far from given ground gets its second class
+    SURENESS = 3  #: what is not sure enough loses its class
+    HEIGHTS = 4  #: low and medium vegetation
+
+
+class ModelObserver(Protocol):
+    """Receives how points of a cloud come to their class."""
+
+    def see_inputs(self, inputs: PassInputs) -> None:
+        """Receive what a pass read of points to classify."""
+
+    def see_classes(
+        self,
+        step: ClassStep,
+        codes: npt.NDArray[np.uint8],
+        least: npt.NDArray[np.float32] | None = None,
+    ) -> None:
+        """Receive the classes (n,) after a step, and the least reliability (n,) that keeps them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from .input_dimensions import list_values, optional_dimensions, required_dimensi
 from .interface import (
     BatchEstimator,
     Block,
+    ClassStep,
     Estimator,
     InputPlan,
     PointEstimator,
@@ -281,11 +282,15 @@ class Model:
             None if work.stands_for_others else progress,
             work.grid,
             how.device,
-            work.observe(how.observe),
+            work.observe(None if how.observer is None else how.observer.see_inputs),
         )
         self._classify(work, request, columns, progress)
+        if how.observer is not None:
+            how.observer.see_classes(ClassStep.LIKELIEST, columns["classification"])
         if roles.not_ground is not None:
             request.report.figures["too_far_for_ground"] = move_from_ground(columns, roles)
+            if how.observer is not None:
+                how.observer.see_classes(ClassStep.GIVEN_GROUND, columns["classification"])
         if len(work.xyz) < len(roles.wanted) - roles.ignored:
             request.report.figures["representatives"] = len(work.xyz)
         rejected = reject(columns, roles, how)

@@ -21,7 +21,7 @@ from ..base.options import Settings, setting
 from ..features.point_grid import CellGrid, build_grid
 from ..features.voxels import Members, Representatives
 from .calibration import ReliabilityLimits
-from .interface import Block, Observe, PassInputs
+from .interface import Block, ClassStep, ModelObserver, Observe, PassInputs
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,7 @@ class PredictionOptions(Settings):
     )
     #: as `reject_below`, by class; the larger one counts
     limits: ReliabilityLimits | None = None
-    #: receives what each pass read of the points that are computed for those to classify
-    observe: Observe | None = None
+    observer: ModelObserver | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,14 +275,17 @@ def reject(
 ) -> npt.NDArray[np.int64]:
     """Take the class from points that are not reliable enough; return their rows in the cloud."""
     code = columns["classification"]
+    if options.limits is None and not options.reject_below:
+        return np.zeros(0, np.int64)
     least = np.full(256, options.reject_below or 0.0, np.float32)
     if options.limits is not None:
         np.maximum(least, options.limits.least_reliability(), out=least)
-    if not least.any():
-        return np.zeros(0, np.int64)
-    rows = np.flatnonzero(roles.wanted & (columns["reliability"] < least[code]))
+    limit = least[code]
+    rows = np.flatnonzero(roles.wanted & (columns["reliability"] < limit))
     kept = UNCLASSIFIED if roles.current is None else roles.current[rows]
     code[rows] = kept if options.rejected_code is None else options.rejected_code
+    if options.observer is not None:
+        options.observer.see_classes(ClassStep.SURENESS, code, limit)
     return rows
 
 

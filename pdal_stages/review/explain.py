@@ -80,7 +80,7 @@ def explain_points(
         around = Surroundings(files, box)
         found = [around.nearest(places[number], unit) for number in members]
         rows = np.array([row for row, _ in found])
-        recording = Recording(around, request, reference, rows)
+        recording = Recording(around, reference, request.where, rows)
         recording.run(pipeline)
         if reach < far:
             recording.notes.append(f"{_TOO_MANY} {reach * unit:.0f} m are not read")

@@ -97,7 +97,6 @@ class Verdict:
     stands_for_it_m: float | None  #: how far away the point of its voxel is that is computed
     #: classes that the last pass found likely and the model then excluded: what lies on no line
     excluded: Sequence[int]
-    limit: float | None  #: least reliability that keeps the class
 
 
 @dataclass(frozen=True)

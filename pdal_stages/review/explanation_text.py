@@ -14,7 +14,7 @@ from ..base.asprs import (
     class_name,
 )
 from ..base.messages import one_line
-from ..terrain.detached import HELD, SOLID
+from ..terrain.detached import HEAVY, HELD, LOOSE, SOLID, UNJUDGED
 from .explanation import Explanation, GroundSteps, PassInput, PassTrace, Verdict
 from .input_words import words_for
 from .trace_points import SURROUNDINGS
@@ -40,6 +40,15 @@ _MAKERS = {
     LOW_VEGETATION: "--vegetation-heights",
     MEDIUM_VEGETATION: "--vegetation-heights",
     BRIDGE: "--bridges",
+}
+_APART = "no: it stands apart, but neither above what is around nor below the ground"
+#: Why a point is no noise, by its state.
+_NO_NOISE = {
+    SOLID: "no: it belongs to something large, with points close to each other",
+    HELD: "no: it stands apart, but near something large",
+    LOOSE: _APART,
+    HEAVY: _APART,
+    UNJUDGED: "not judged: it is left out, or there are too few points",
 }
 #: What to do where the run that made a file differs from that of now.
 _AGAIN = (
@@ -153,11 +162,7 @@ def _noise(told: Explanation) -> str:
     if told.noise.code:
         where = "below the ground" if told.noise.code == 7 else "in the air"
         return f"yes, {_class(told.noise.code)}: alone or in a small cluster, {where}"
-    if told.noise.state == SOLID:
-        return "no: it belongs to something large, with points close to each other"
-    if told.noise.state == HELD:
-        return "no: it stands apart, but near something large"
-    return "no: it stands apart, but neither above what is around nor below the ground"
+    return _NO_NOISE[told.noise.state]
 
 
 # ---- the ground filter ---------------------------------------------------------------------------

@@ -18,16 +18,15 @@ from ..base.errors import NoTerrainError, StageError
 from ..base.grid import GridWindow
 from ..base.las_check import beyond_box
 from ..base.las_points import USUAL, LasColumns, Layout, read_records
-from ..classifier.interface import PassInputs
+from ..classifier.interface import ClassStep, PassInputs
 from ..classifier.model import OTHER_DENSITY
 from ..features.cell_means import density
-from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.copies import run_stages, selection
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import ExpandedStage
 from ..pipeline.spatial_reference import Reference
 from ..stages.apply_model import ApplyModel
-from ..stages.base import Observer, used_distances
+from ..stages.base import Kept, Observer, Stage, used_distances
 from ..stages.points import RESERVED
 from .explanation import AskedPlace
 
@@ -140,51 +139,56 @@ class Surroundings(LazyColumns):
         )
 
 
+#: What each step of the ground filter made of a piece of the cloud, by its name.
+PieceRasters = dict[str, tuple[GridWindow, NDArray[np.float32]]]
+
+
 @dataclass(eq=False)
-class Recording:
-    """What stages made of the points that are explained, and how they came to it."""
+class Recording(Observer):
+    """What stages made of the points that are explained, as they tell it themselves."""
 
     around: Surroundings
-    request: ClassifyRequest
     reference: Reference
+    where: str | None  #: condition of the points that are classified
     rows: NDArray[np.int64]  #: (m,) of the points in the surroundings
-    rows_seen: NDArray[np.int64] = field(init=False)  #: (m,) of the points among those near
-    stages: list[ExpandedStage] = field(default_factory=list)
+    rows_seen: NDArray[np.int64] = field(init=False)  #: (m,) of the points where stages run
+    stages: list[Stage] = field(default_factory=list)
     classes: list[NDArray[np.uint8]] = field(default_factory=list)  #: (m,) after each stage
-    #: by piece of the cloud what each step of the ground filter made
-    pieces: list[dict[str, tuple[GridWindow, NDArray[np.float32]]]] = field(default_factory=list)
-    heights: Mapping[str, NDArray] = field(default_factory=dict)  #: columns of the ground filter
+    pieces: list[PieceRasters] = field(default_factory=list)
+    #: (m,) states of noise, and columns of the ground filter; empty without these stages
+    noise: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    heights: dict[str, NDArray] = field(default_factory=dict)
+    kept: dict[Kept, NDArray[np.bool_]] = field(default_factory=dict)  #: (m,) each
     inputs: list[PassInputs] = field(default_factory=list)
-    #: dimensions of the points near after all stages
-    seen: Mapping[str, NDArray] = field(default_factory=dict)
+    #: (m,) classes after each step of the model's stage, and the least reliability that keeps them
+    steps: dict[ClassStep, tuple[NDArray[np.uint8], NDArray[np.float32] | None]] = field(
+        default_factory=dict
+    )
+    #: (m,) dimensions after all stages
+    results: Mapping[str, NDArray] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def run(self, pipeline: Pipeline) -> None:
         """Run the stages; those from the model on on points near, and for the points alone."""
         ours, unit = pipeline.expanded.ours, self.reference.units.horizontal
-        observer = Observer(self._keep, self._keep_heights, self.inputs.append)
         for each in ours:
-            each.update_context(observer=observer)
+            each.update_context(observer=self)
         first = next(n for n, each in enumerate(ours) if isinstance(each.stage, ApplyModel))
         columns, wkt = self.around, self.reference.wkt
-        known = selection(self.request.where, columns)
+        self.rows_seen = self.rows
+        known = selection(self.where, columns)
         try:
             seen = run_stages(ours[:first], columns, wkt, known, self._keep_classes)
         except NoTerrainError as error:
             raise NoTerrainError(
                 f"around the place {error.what}",
-                found=f"{len(self.around.number):,} points, all that are read",
+                found=f"{len(columns.number):,} points, all that are read",
                 cure="Explain places nearer to ground, or leave --ground given out",
             ) from None
         reach = (sum(each.stage.halo_m() for each in ours[first:]) + _MARGIN_M) / unit
-        x, y = (columns[axis] for axis in "XY")
-        near = np.ones(len(x), np.bool_)
-        for axis in (x, y):
-            asked = axis[self.rows]
-            near &= (axis >= asked.min() - reach) & (axis <= asked.max() + reach)
-        rows = np.flatnonzero(near)
-        self.rows_seen = np.searchsorted(rows, self.rows)
-        xy = np.column_stack([x[rows], y[rows]])
+        near = _rows_near(columns, self.rows, reach)
+        self.rows_seen = np.searchsorted(near, self.rows)
+        xy = np.column_stack([columns[axis][near] for axis in "XY"])
         outside = unit * cKDTree(xy[self.rows_seen]).query(xy, p=np.inf)[0]
         outside[self.rows_seen] = -1.0
         after = [each.stage for each in ours[first:]]
@@ -193,20 +197,55 @@ class Recording:
         )
         for each, used_m in zip(ours[first:], used, strict=True):
             each.update_context(outside=_OUTSIDE, used_m=used_m)
-        part, known = SomeRows(seen, rows), {_OUTSIDE: outside}
-        self.seen = run_stages(ours[first:], part, wkt, known, self._keep_classes)
+        part, known = SomeRows(seen, near), {_OUTSIDE: outside}
+        seen = run_stages(ours[first:], part, wkt, known, self._keep_classes)
+        self.results = SomeRows(seen, self.rows_seen)
         texts = [*pipeline.expanded.warnings, *pipeline.messages]
         self.notes = [text for text in texts if OTHER_DENSITY not in text]
 
-    def _keep(self, name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
-        if not self.pieces or name in self.pieces[-1]:  # each piece begins with the same step
+    def _keep_classes(self, each: ExpandedStage, seen: Mapping[str, NDArray]) -> None:
+        self.stages.append(each.stage)
+        self.classes.append(seen["Classification"][self.rows_seen])
+
+    def see_noise(self, states: NDArray[np.uint8]) -> None:
+        """Keep the states of noise."""
+        self.noise = states[self.rows_seen]
+
+    def see_raster(self, name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
+        """Keep a raster; the first step's begins another piece."""
+        if not self.pieces or name in self.pieces[-1]:
             self.pieces.append({})
         self.pieces[-1][name] = window, values
 
-    def _keep_heights(self, columns: Mapping[str, NDArray]) -> None:
-        self.heights = columns
+    def see_heights(self, columns: Mapping[str, NDArray]) -> None:
+        """Keep the columns of the ground filter."""
+        self.heights = {name: values[self.rows_seen] for name, values in columns.items()}
 
-    def _keep_classes(self, each: ExpandedStage, seen: Mapping[str, NDArray]) -> None:
-        rows = self.rows if len(seen["X"]) == len(self.around.number) else self.rows_seen
-        self.stages.append(each)
-        self.classes.append(np.array(seen["Classification"][rows]))
+    def see_kept(self, points: Mapping[Kept, NDArray[np.bool_]]) -> None:
+        """Keep why the model leaves points alone."""
+        self.kept = {reason: which[self.rows_seen] for reason, which in points.items()}
+
+    def see_inputs(self, inputs: PassInputs) -> None:
+        """Keep what a pass read."""
+        self.inputs.append(inputs)
+
+    def see_classes(
+        self,
+        step: ClassStep,
+        codes: NDArray[np.uint8],
+        least: NDArray[np.float32] | None = None,
+    ) -> None:
+        """Keep classes after a step of the model's stage."""
+        limit = None if least is None else least[self.rows_seen]
+        self.steps[step] = codes[self.rows_seen], limit
+
+
+def _rows_near(
+    columns: Mapping[str, NDArray], rows: NDArray[np.int64], reach: float
+) -> NDArray[np.int64]:
+    """Return the rows of the points in the box around those of `rows`, `reach` wider."""
+    near = np.ones(len(columns["X"]), np.bool_)
+    for axis in (columns["X"], columns["Y"]):
+        at = axis[rows]
+        near &= (axis >= at.min() - reach) & (axis <= at.max() + reach)
+    return np.flatnonzero(near)

@@ -1,28 +1,23 @@
-"""Trace a point through a run: noise, ground filter, passes of the model, what came after."""
+"""Trace a point through a recording: noise, ground filter, passes of the model, what came after."""
 
 from __future__ import annotations
 
-from collections import ChainMap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.asprs import GROUND, TERRAIN
-from ..base.columns import SomeRows
+from ..base.asprs import GROUND
 from ..base.dimensions import opening
-from ..base.grid import cell_numbers
 from ..classifier.feature_forest import FeatureForest
-from ..classifier.interface import PassInputs
+from ..classifier.interface import ClassStep, PassInputs
 from ..classifier.model import Model
 from ..classifier.training_percentiles import PERCENTILES, PercentileTable
 from ..stages.apply_model import ApplyModel
+from ..stages.base import Kept
 from ..stages.detached_noise import DetachedNoise
 from ..stages.hag_morphological import HagMorphological
-from ..stages.points import Points
-from ..terrain.detached import find_detached
-from ..terrain.heights import JUDGED
-from ..terrain.noise import REACH as NOISE_REACH
+from ..terrain.heights import JUDGED, PLACED
 from .explanation import (
     Explanation,
     FoundPoint,
@@ -52,42 +47,42 @@ def trace_point(
 
     `against` is the class that the one found is compared with, if the model has both.
     """
-    row, at = int(recording.rows[place]), int(recording.rows_seen[place])
-    columns = recording.around
-    stages = [each.stage for each in recording.stages]
-    model_at = next(n for n, stage in enumerate(stages) if isinstance(stage, ApplyModel))
-    model_stage = stages[model_at]
-    assert isinstance(model_stage, ApplyModel)
+    columns, row = recording.around, int(recording.rows[place])
     codes = [int(columns["Classification"][row]), *(int(c[place]) for c in recording.classes)]
-    kept = _why_kept(recording, model_stage, at, codes[model_at])
-    verdict, steps = None, []
+    after = {type(stage): code for stage, code in zip(recording.stages, codes[1:], strict=True)}
+    model_at = next(n for n, s in enumerate(recording.stages) if isinstance(s, ApplyModel))
+    kept = _why_kept(recording, place, codes[model_at])
+    verdict: Verdict | None = None
+    steps: list[tuple[str, int]] = []
+    compared: dict[str, tuple[float, float, bool]] = {}
     if not kept:
-        verdict = _verdict(recording, model_stage, place, against or codes[0])
-        steps = _own_steps(model_stage, recording, row, verdict, codes[model_at + 1])
-    steps += [
-        (stage.type, code)
-        for stage, code in zip(stages[model_at + 1 :], codes[model_at + 2 :], strict=True)
-    ]
-    compared = {}
-    for name, step in _COMPARED.items():
-        if name in columns and name in recording.seen and not kept:
-            before, now = float(columns[name][row]), float(recording.seen[name][at])
-            compared[name] = before, now, abs(before - now) <= 0.51 * step + 1e-4
+        verdict = _verdict(recording, place, against or codes[0])
+        steps = _steps_of_model(recording, place)
+        for name, step in _COMPARED.items():
+            if name in columns and name in recording.results:
+                before, now = float(columns[name][row]), float(recording.results[name][place])
+                compared[name] = before, now, abs(before - now) <= 0.51 * step + 1e-4
+    later = zip(recording.stages[model_at + 1 :], codes[model_at + 2 :], strict=True)
+    noise = None
+    if len(recording.noise):
+        code = after[DetachedNoise]
+        noise = Noise(code if code != codes[0] else 0, int(recording.noise[place]))
+    point = _point(recording, row, distance_m)
     return Explanation(
-        _found(recording, row, distance_m),
+        point,
         codes[0],
         codes[-1],
         kept,
-        _noise(recording, row, next((s for s in stages if isinstance(s, DetachedNoise)), None)),
-        _ground(recording, row, next((s for s in stages if isinstance(s, HagMorphological)), None)),
+        noise,
+        _ground(recording, place),
         verdict,
-        steps,
+        [*steps, *((stage.type, code) for stage, code in later)],
         compared,
         recording.notes,
     )
 
 
-def _found(recording: Recording, row: int, distance_m: float) -> FoundPoint:
+def _point(recording: Recording, row: int, distance_m: float) -> FoundPoint:
     """Return what the file has of a point."""
     around = recording.around
     names = ("X", "Y", "Z", "ReturnNumber", "NumberOfReturns")
@@ -97,88 +92,56 @@ def _found(recording: Recording, row: int, distance_m: float) -> FoundPoint:
     return FoundPoint(file, int(around.number[row]), x, y, z, distance_m, number, returns, checked)
 
 
-def _why_kept(recording: Recording, stage: ApplyModel, at: int, code: int) -> str:
+def _why_kept(recording: Recording, place: int, code: int) -> str:
     """Return why the model leaves a point alone whose class was `code` before; empty if not."""
-    one = SomeRows(recording.seen, np.array([at]))
-    codes = {"Classification": np.array([code], np.uint8)}
-    point = stage.points(ChainMap(codes, one), wkt=recording.reference.wkt)  # type: ignore[arg-type]
-    if not point.inside[0]:
-        return f"it lies outside --where {recording.request.where}"
-    if point.chosen(stage.ignore)[0]:
-        return "it is withheld" if point.flag("Withheld")[0] else f"class {code} is left out"
-    if stage.given_ground and code in TERRAIN:
-        return f"class {code} is given ground, which keeps its class"
-    return f"class {code} is kept" if point.chosen(stage.keep)[0] else ""
+    texts = {
+        Kept.OUTSIDE: f"it lies outside --where {recording.where}",
+        Kept.IGNORED: f"class {code} is left out",
+        Kept.GIVEN_GROUND: f"class {code} is given ground, which keeps its class",
+        Kept.KEPT: f"class {code} is kept",
+    }
+    if recording.around["Withheld"][recording.rows[place]]:
+        texts[Kept.IGNORED] = "it is withheld"
+    return next((texts[reason] for reason in Kept if recording.kept[reason][place]), "")
 
 
-def _axes(recording: Recording, rows: NDArray | slice) -> list[NDArray[np.float64]]:
-    """Return x, y and z (m,) of rows in meters, as stages see them."""
-    units = recording.reference.units
-    scales = (units.horizontal, units.horizontal, units.vertical)
-    columns = recording.around
-    return [
-        np.rint(columns[axis][rows] * 1e6) / 1e6 * scale
-        for axis, scale in zip("XYZ", scales, strict=True)
-    ]
-
-
-def _noise(recording: Recording, row: int, stage: DetachedNoise | None) -> Noise | None:
-    """Return whether a point is noise by the points around that matter."""
-    if stage is None:
-        return None
-    x, y, _ = _axes(recording, slice(None))
-    near = np.flatnonzero(np.maximum(np.abs(x - x[row]), np.abs(y - y[row])) <= NOISE_REACH + 1.0)
-    some = SomeRows(recording.around, near)
-    near = near[~Points(some, recording.reference.wkt).chosen(stage.ignore)]
-    if row not in near:
-        return None
-    near_x, near_y, near_z = _axes(recording, near)
-    state = find_detached(near_x, near_y, near_z, stage.cluster, stage.gap)
-    before = recording.around["Classification"][row]
-    number = next(n for n, each in enumerate(recording.stages) if each.stage is stage)
-    after = recording.classes[number][np.flatnonzero(recording.rows == row)[0]]
-    return Noise(int(after) if after != before else 0, int(state[np.searchsorted(near, row)]))
-
-
-def _ground(recording: Recording, row: int, stage: HagMorphological | None) -> GroundSteps | None:
+def _ground(recording: Recording, place: int) -> GroundSteps | None:
     """Return what each step of the ground filter made of a point and its cell."""
-    if stage is None or not recording.pieces:
+    heights = {name: values[place].item() for name, values in recording.heights.items()}
+    if not heights or np.isnan(heights["HeightAboveGround"]):
         return None
-    x, y, z = (float(axis[0]) for axis in _axes(recording, np.array([row])))
-    cell = stage.cell
-    column, line = (int(cell_numbers(np.array([v]), cell)[0]) for v in (x, y))
+    stage = next(s for s in recording.stages if isinstance(s, HagMorphological))
+    number, column, line = (heights[name] for name in PLACED)
+    piece, cell = recording.pieces[number], stage.cell
+    columns, row, units = recording.around, recording.rows[place], recording.reference.units
+    z = float(columns["Z"][row]) * units.vertical
 
-    def depth(piece: Mapping) -> int:
-        left, bottom, width, height = next(iter(piece.values()))[0]
-        return min(column - left, left + width - column, line - bottom, bottom + height - line)
-
-    piece = max(recording.pieces, key=depth)
-
-    def made(step: str, around: int = 0) -> float | None:
+    def elevation(step: str, cells: int = 0) -> float | None:
         """Return what a step made of the cell, or the least of those around, above the point."""
         if step not in piece:
             return None
         window, values = piece[step]
         j, i = line - window.bottom, column - window.left
-        part = values[max(j - around, 0) : j + around + 1, max(i - around, 0) : i + around + 1]
+        part = values[max(j - cells, 0) : j + cells + 1, max(i - cells, 0) : i + cells + 1]
         known = part[np.isfinite(part)]
         return float(known.min()) - z if len(known) else None
 
-    xs, ys, zs = _axes(recording, slice(None))
-    near = np.hypot(xs - x, ys - y) <= _NEAR_M
-    heights = {name: float(values[row]) for name, values in recording.heights.items()}
-    rounds = [name for name in piece if name.startswith("round_")]
+    away_x = (columns["X"] - columns["X"][row]) * units.horizontal
+    strip = np.flatnonzero(np.abs(away_x) <= _NEAR_M)
+    away_y = (columns["Y"][strip] - columns["Y"][row]) * units.horizontal
+    near = strip[np.hypot(away_x[strip], away_y) <= _NEAR_M]
+    lower = columns["Z"][near] * units.vertical < z - _LOWER_M
     return GroundSteps(
         cell,
         2 * stage.options["window"] + cell,
-        made("low_outliers") if "low_outliers" in piece else made("minimum_grid"),
-        made("openings"),
-        made("wide_roofs"),
-        [made(name) is not None for name in rounds],
-        made("given_ground"),
-        made("low_outliers", round(_NEAR_M / cell)),
-        int(np.count_nonzero(near)),
-        int(np.count_nonzero(near & (zs < z - _LOWER_M))),
+        elevation("low_outliers" if "low_outliers" in piece else "minimum_grid"),
+        elevation("openings"),
+        elevation("wide_roofs"),
+        [elevation(name) is not None for name in piece if name.startswith("round_")],
+        elevation("given_ground"),
+        elevation("low_outliers", round(_NEAR_M / cell)),
+        len(near),
+        int(np.count_nonzero(lower)),
         stage.given_ground,
         heights["HeightAboveGround"],
         heights[JUDGED[0]],
@@ -191,29 +154,33 @@ def _ground(recording: Recording, row: int, stage: HagMorphological | None) -> G
 # ---- the model -----------------------------------------------------------------------------------
 
 
-def _verdict(recording: Recording, stage: ApplyModel, place: int, against: int) -> Verdict:
+def _model_stage(recording: Recording) -> ApplyModel:
+    """Return the stage of the model."""
+    return next(stage for stage in recording.stages if isinstance(stage, ApplyModel))
+
+
+def _verdict(recording: Recording, place: int, against: int) -> Verdict:
     """Return what the model said of a point; `against` is the rival, if it can be."""
+    stage = _model_stage(recording)
     model, names = stage.model, dict(stage.model.classes)
-    row, at = recording.rows[place], recording.rows_seen[place]
-    shares = {code: float(recording.seen[f"Probability_{code}"][at]) for code in names}
-    order = sorted(names, key=lambda code: -shares[code])
-    rival = against if against in names and against != order[0] else order[1]
+    at, units = recording.rows_seen[place], recording.reference.units
+    shares = {code: float(recording.results[f"Probability_{code}"][place]) for code in names}
+    winner = int(recording.steps[ClassStep.LIKELIEST][0][place])
+    others = [code for code in names if code != winner]
+    rival = against if against in others else max(others, key=lambda code: shares[code])
     by_pass: dict[int, PassTrace] = {}
     stands = None
     for each in recording.inputs:
-        if each.number not in by_pass and (found := np.flatnonzero(each.rows == at)).size:
-            by_pass[each.number] = _trace_pass(model, each, int(found[0]))
-            own = np.column_stack(_axes(recording, np.array([row])))
-            away = float(np.linalg.norm(each.xyz[found[0]] - own))
-            stands = away if away > 1e-6 else None
+        if each.number not in by_pass and (rows := np.flatnonzero(each.rows == at)).size:
+            by_pass[each.number] = _trace_pass(model, each, int(rows[0]))
+            xyz = [recording.around[axis][recording.rows[place]] for axis in "XYZ"]
+            meters = np.array(xyz) * [units.horizontal, units.horizontal, units.vertical]
+            away = float(np.linalg.norm(each.xyz[rows[0]] - meters))
+            stands = away if away > 1e-5 else None
     passes = [by_pass[number] for number in sorted(by_pass)]
     last = passes[-1].probabilities if passes else {}
     lost = [code for code in last if last[code] == max(last.values()) and not shares[code]]
-    least = np.zeros(256) if stage.limits is None else stage.limits.least_reliability()
-    limit = max(float(least[order[0]]), stage.reject_below or 0.0)
-    return Verdict(
-        stage.model_file, names, shares, order[0], rival, passes, stands, lost, limit or None
-    )
+    return Verdict(stage.model_file, names, shares, winner, rival, passes, stands, lost)
 
 
 def _trace_pass(model: Model, read: PassInputs, at: int) -> PassTrace:
@@ -264,23 +231,20 @@ def share_below(value: float, percentiles: Sequence[float]) -> float:
     return float(shares[first - 1] + part * (shares[first] - shares[first - 1]))
 
 
-def _own_steps(
-    stage: ApplyModel, recording: Recording, row: int, verdict: Verdict, code: int
-) -> list[tuple[str, int]]:
+def _steps_of_model(recording: Recording, place: int) -> list[tuple[str, int]]:
     """Return what the model's stage did after the verdict, and the class after each step."""
-    now, steps = verdict.winner, []
-    heights = stage.vegetation_heights
-    if stage.given_ground and now == GROUND:
-        if recording.heights and not recording.heights["Ground"][row]:
-            others = [each for each in verdict.classes if each != now]
-            now = max(others, key=lambda each: verdict.probabilities[each])
-        steps.append(("--ground given", now))
-    if stage.limits is not None or stage.reject_below:
-        limit = verdict.limit or 0.0
-        sure = np.float32(verdict.probabilities[now]) >= np.float32(limit)
-        now = now if sure else code
-        sure_from = f"from a probability of {limit:.2f} on" if limit else "no limit for it"
-        steps.append((f"--keep-sure ({sure_from})", now))
-    if heights:
-        steps.append((f"--vegetation-heights {heights[0]:g},{heights[1]:g}", code))
+    heights = _model_stage(recording).vegetation_heights
+    texts = {
+        ClassStep.GIVEN_GROUND: "--ground given",
+        ClassStep.HEIGHTS: f"--vegetation-heights {','.join(f'{height:g}' for height in heights)}",
+    }
+    steps = []
+    if recording.steps[ClassStep.LIKELIEST][0][place] != GROUND:
+        del texts[ClassStep.GIVEN_GROUND]
+    for step, (codes, least) in recording.steps.items():
+        if least is not None:
+            limit = f"from a probability of {least[place]:.2f} on"
+            texts[step] = f"--keep-sure ({limit if least[place] else 'no limit for it'})"
+        if step in texts:
+            steps.append((texts[step], int(codes[place])))
     return steps

@@ -32,12 +32,12 @@ from ..base.json_types import StageJson
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, is_too_flat, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
-from ..classifier.interface import Observe
+from ..classifier.interface import ClassStep
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
 from ..classifier.prediction import PointRoles, Prediction, PredictionOptions
 from ..terrain.filter_options import FilterOptions
-from .base import Stage, StageContext
+from .base import Kept, Observer, Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
 from .points import LAS_DIMENSIONS, Points, class_counts
 from .preprocessing import as_json, same, with_given_ground
@@ -235,11 +235,11 @@ class ApplyModel(Stage, settings=PredictionOptions):
         unsure = UNCLASSIFIED if self.keep_sure is not None else None
         return unsure if self.rejected_code is None else self.rejected_code
 
-    def _prediction(self, observe: Observe | None) -> PredictionOptions:
+    def _prediction(self, observer: Observer | None) -> PredictionOptions:
         """Return the options of classifying a cloud."""
-        names = [field.name for field in fields(PredictionOptions) if field.name != "observe"]
+        names = [field.name for field in fields(PredictionOptions) if field.name != "observer"]
         values = {**{name: getattr(self, name) for name in names}, "rejected_code": self._rejected}
-        return PredictionOptions(**values, observe=observe)
+        return PredictionOptions(**values, observer=observer)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Classify the points."""
@@ -249,8 +249,11 @@ class ApplyModel(Stage, settings=PredictionOptions):
         ignored, kept = points.ignored(self.ignore), points.chosen(self.keep)
         inside = points.inside
         current = points.class_codes
-        if self.given_ground:
-            kept = kept | np.isin(current, TERRAIN)
+        is_terrain = np.isin(current, TERRAIN) if self.given_ground else np.zeros_like(kept)
+        if context.observer is not None:
+            alone = (~inside, ignored, is_terrain, kept)
+            context.observer.see_kept(dict(zip(Kept, alone, strict=True)))
+        kept = kept | is_terrain
         points.tally("kept", inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         dimensions = {
@@ -267,13 +270,15 @@ class ApplyModel(Stage, settings=PredictionOptions):
         points.keep_only([*dimensions, *self.creates(), _HEIGHT])
         with Progress(int(np.count_nonzero(wanted)), self.type) as progress:
             roles = PointRoles.check(points.count, wanted, ignored, current, ground)
-            how = self._prediction(context.observer and context.observer.observe)
+            how = self._prediction(context.observer)
             prediction = self.model.classify(points.take_xyz(), dimensions, roles, how, progress)
         rejected = np.zeros(points.count, np.bool_)
         rejected[prediction.unsure] = True
         codes = prediction.classification
         if self.vegetation_heights:
             by_height(codes, wanted & ~rejected, points.dimension(_HEIGHT), self.vegetation_heights)
+            if context.observer is not None:
+                context.observer.see_classes(ClassStep.HEIGHTS, codes)
             prediction.report.figures["classes"] = class_counts(codes[wanted])
         if _HEIGHT in points.arrays:
             leaves = wanted & np.isin(codes, (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION))

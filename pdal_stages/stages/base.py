@@ -6,7 +6,8 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from enum import Enum
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 from ..base.dimensions import CLASSIFICATION, Dimension
 from ..base.errors import StageError
 from ..base.files import Output, check_writable
+from ..base.grid import GridWindow
 from ..base.json_types import JsonObject, StageJson
 from ..base.options import Option, decode_options, option, option_of, parse_options
 from ..base.units import named_unit
-from ..classifier.interface import Observe
-from ..terrain.filter_options import Keep
+from ..classifier.interface import ModelObserver
 from .options import Selection, ignore_option
 from .points import Points
 from .where_expression import Expression
@@ -50,13 +51,29 @@ def used_distances(reaches_m: Sequence[float], sees: Callable[[int, int], bool])
     return used
 
 
-class Observer(NamedTuple):
-    """Functions that receive how stages come to their results."""
+class Kept(Enum):
+    """Reasons for which a model's stage leaves the class of a point; the first one counts."""
 
-    keep: Keep  #: what each step of the ground filter made
-    #: the columns (n,) of :func:`..terrain.heights.filtered_ground` by name
-    columns: Callable[[Mapping[str, NDArray]], None]
-    observe: Observe  #: what each pass of a model read of the points to classify
+    OUTSIDE = 1  #: outside `where`
+    IGNORED = 2
+    GIVEN_GROUND = 3
+    KEPT = 4
+
+
+class Observer(ModelObserver, Protocol):
+    """Receives how stages come to their results; (n,) are the points that the stage runs on."""
+
+    def see_noise(self, states: NDArray[np.uint8]) -> None:
+        """Receive the states (n,) of :mod:`..terrain.detached`."""
+
+    def see_raster(self, name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
+        """Receive what a step of the ground filter made of a piece of the cloud."""
+
+    def see_heights(self, columns: Mapping[str, NDArray]) -> None:
+        """Receive the columns (n,) of :func:`..terrain.heights.filtered_ground` by name."""
+
+    def see_kept(self, points: Mapping[Kept, NDArray[np.bool_]]) -> None:
+        """Receive which points (n,) are left alone by the model, and why."""
 
 
 @dataclass(frozen=True)

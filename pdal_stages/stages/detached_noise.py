@@ -5,7 +5,7 @@ from __future__ import annotations
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
-from ..terrain.noise import REACH, detached_noise
+from ..terrain.noise import REACH, judge_noise
 from .base import ClassStage, StageContext
 from .options import option
 from .points import Points, class_counts
@@ -57,7 +57,9 @@ class DetachedNoise(ClassStage):
         ignored = points.ignored(self.ignore)
         sizes = {name: self.options[name] for name in ("cluster", "gap", "depth")}
         mask = ~ignored if ignored.any() else None
-        noise = detached_noise(*points.axes, mask=mask, threads=self.threads, **sizes)
+        noise, states = judge_noise(*points.axes, mask=mask, threads=self.threads, **sizes)
+        if context.observer is not None:
+            context.observer.see_noise(states)
         if points.mask is not None:
             noise[~points.mask] = 0
         codes = points.class_codes.copy()

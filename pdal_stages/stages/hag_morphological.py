@@ -23,7 +23,7 @@ from ..terrain.ground_blocks import (
     reach_of_block,
     reduced_points,
 )
-from ..terrain.heights import filtered_ground
+from ..terrain.heights import filtered_ground, spread
 from ..terrain.smrf import reach_of_cells, reach_of_given, reach_of_points
 from .base import HEIGHTS_OUTSIDE, Blocks, FarReaching, StageContext, inside_block
 from .options import Selection, ignore_option, option
@@ -150,21 +150,22 @@ class HagMorphological(FarReaching, settings=FilterOptions):
                 found=f"{points.count:,} points",
                 cure="Classify the ground first, or leave 'given_ground' out: ground is then found",
             )
-        watched = context.observer
-        keep = self._write_rasters(points) if watched is None else watched.keep
+        observer = context.observer
+        keep = self._write_rasters(points) if observer is None else observer.see_raster
         columns = filtered_ground(
             *(points.axes if all_wanted else [axis[wanted] for axis in points.axes]),
             mask=usable if all_wanted else usable[wanted],
-            **{**vars(self._filter), "keep": keep, "judged": watched is not None},
+            **{**vars(self._filter), "keep": keep, "judged": observer is not None},
             cells=None if context.blocks is None else GroundCells(context.blocks),
             figures=points.report.figures,
             ground=ground if ground is None or all_wanted else ground[wanted],
         )
-        if watched is not None:
-            watched.columns(columns)
+        if observer is not None:
+            each = columns.items()
+            observer.see_heights({name: spread(v, wanted, points.count) for name, v in each})
         out = {}
         for name in self.creates():
-            values = columns[name] if watched is not None else columns.pop(name)
+            values = columns.pop(name)
             if is_height(name) and points.units.vertical != 1.0:
                 values = values / points.units.vertical
             # As PDAL will have it; a copy more of each would be the most that this stage holds.

@@ -39,6 +39,8 @@ LOOSE: int = 2
 #: State of a compact component of more points than a cluster, with nothing solid close: ground in a
 #: courtyard, or many echoes from below.
 HEAVY: int = 3
+#: State of what nobody has judged.
+UNJUDGED: int = 255
 
 
 class DetachedRules(NamedTuple):

@@ -60,6 +60,9 @@ MAX_CELLS_PER_POINT = 2.5
 MAX_CELLS = 50_000_000
 #: Columns of `judged` points.
 JUDGED = ("HeightAboveProvisional", "GroundTolerance")
+#: Columns that tell where these lie: number of the piece, in the order in which rasters of pieces
+#: are kept, and column and row of the cell.
+PLACED = ("Piece", "CellColumn", "CellRow")
 
 
 class _Piece(NamedTuple):
@@ -107,7 +110,7 @@ def filtered_ground(
     dict of str to ndarray, shape (n,)
         ``HeightAboveGround`` (float64), ``Ground`` (uint8, 1 for ground), ``Slope`` (float64,
         degrees), ``HeightAboveOpening_<window>`` (float32), and, where they are wanted, those of
-        :data:`JUDGED`. NaN where a coordinate is not finite.
+        :data:`JUDGED` and :data:`PLACED`. NaN where a coordinate is not finite.
 
     Raises
     ------
@@ -128,12 +131,12 @@ def filtered_ground(
         out["Ground"][known] = 1
     counts["ground_points"] = int(np.count_nonzero(out["Ground"]))
     counts["unused_points"] = int(len(x) - np.count_nonzero(use))
-    return out if finite.all() else {k: _spread(v, rows, len(x)) for k, v in out.items()}
+    return out if finite.all() else {k: spread(v, rows, len(x)) for k, v in out.items()}
 
 
-def _spread(values: NDArray, rows: Any, count: int) -> NDArray:
+def spread(values: NDArray, rows: Any, count: int) -> NDArray:
     """Return the values of some rows among `count`; NaN, or 0 for whole numbers, elsewhere."""
-    whole = np.full(count, 0 if values.dtype == np.uint8 else np.nan, values.dtype)
+    whole = np.full(count, np.nan if values.dtype.kind == "f" else 0, values.dtype)
     whole[rows] = values
     return whole
 
@@ -168,12 +171,16 @@ def _heights(
         **{name: np.zeros(count) for name in JUDGED * options.judged},
         **{opening(width).name: np.zeros(count, np.float32) for width in options.openings},
     }
-    for rows, core, part, raster in pieces if count else ():
+    if options.judged:
+        out |= zip(PLACED, (np.zeros(count, np.int64), points.column, points.row), strict=True)
+    for number, (rows, core, part, raster) in enumerate(pieces if count else ()):
         dimensions, nowhere = _measure(part, raster, options)
         counts["without_terrain"] += int(np.count_nonzero(nowhere[core]))
         places = rows if isinstance(rows, slice) else rows[core]
         for name, values in dimensions.items():
             out[name][places] = values[core]
+        if options.judged:
+            out["Piece"][places] = number
     return out
 
 

@@ -17,7 +17,7 @@ from ..base.asprs import NOISE
 from ..base.grid import cell_keys, cell_numbers, places_among
 from ..base.jit import njit
 from .cells import columns, usable
-from .detached import HEAVY, HELD, LOOSE, SOLID, find_detached, sum_around
+from .detached import HEAVY, HELD, LOOSE, SOLID, UNJUDGED, find_detached, sum_around
 from .detached import REACH as DETACHED_REACH
 from .low_outliers import limits_below_ground
 from .low_outliers import reach as low_reach
@@ -86,23 +86,39 @@ def detached_noise(
     StageError
         If shapes differ.
     """
+    return judge_noise(x, y, z, mask, cluster, gap, depth, threads)[0]
+
+
+def judge_noise(
+    x: ArrayLike,
+    y: ArrayLike | None,
+    z: ArrayLike | None,
+    mask: ArrayLike | None,
+    cluster: int,
+    gap: float,
+    depth: float,
+    threads: int | None,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the codes (n,) of :func:`detached_noise`, and the states (n,) that they come from."""
     x, y, z = columns(x, y, z)
     use = usable(x, y, z, mask=mask)
-    codes = np.zeros(len(x), np.uint8)
+    judged = np.zeros((2, len(x)), np.uint8)
+    judged[1] = UNJUDGED
     inside = slice(None) if use.all() else np.flatnonzero(use)
     x, y, z = x[inside], y[inside], z[inside]
     if len(x):
+        results = judged[:, inside]
         column, row = cell_numbers(x, SIDE), cell_numbers(y, SIDE)
-        found_codes = np.zeros(len(x), np.uint8)
         link = math.ceil(DETACHED_REACH / SIDE)
         for points, core in patches(column, row, math.ceil(REACH / SIDE), link):
             if len(x[points]) > RULES.min_columns:  # fewer show no surface
                 near = x[points], y[points], z[points]
                 state = find_detached(*near, cluster, gap, threads)
                 marks = _judge(*near, column[points], row[points], state, depth, threads)
-                found_codes[points if isinstance(points, slice) else points[core]] = marks[core]
-        codes[inside] = found_codes
-    return codes
+                rows = points if isinstance(points, slice) else points[core]
+                results[:, rows] = marks[core], state[core]
+        judged[:, inside] = results
+    return judged[0], judged[1]
 
 
 def _judge(x, y, z, column, row, state, depth, threads) -> NDArray[np.uint8]:
