@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..base.columns import LazyColumns, SomeRows
+from ..base.dimensions import RELIABILITY
 from ..base.errors import NoTerrainError, StageError
 from ..base.grid import GridWindow
 from ..base.las_check import beyond_box
@@ -169,7 +170,11 @@ class Recording(Observer):
     notes: list[str] = field(default_factory=list)
 
     def run(self, pipeline: Pipeline) -> None:
-        """Run the stages; those from the model on on points near, and for the points alone."""
+        """Run the stages; those from the model on on points near, and for the points alone.
+
+        Stages after the model read the classes of points around from a file that `classify` wrote;
+        for another one they are computed.
+        """
         ours, unit = pipeline.expanded.ours, self.reference.units.horizontal
         for each in ours:
             each.update_context(observer=self)
@@ -192,9 +197,10 @@ class Recording(Observer):
         outside = unit * cKDTree(xy[self.rows_seen]).query(xy, p=np.inf)[0]
         outside[self.rows_seen] = -1.0
         after = [each.stage for each in ours[first:]]
-        used = used_distances(
-            [each.halo_m() for each in after], lambda m, n: after[m].sees_results_of(after[n])
-        )
+        used = [0.0] * len(after)
+        if RELIABILITY.name not in columns:  # else the file has the classes of points around
+            reaches = [each.halo_m() for each in after]
+            used = used_distances(reaches, lambda m, n: after[m].sees_results_of(after[n]))
         for each, used_m in zip(ours[first:], used, strict=True):
             each.update_context(outside=_OUTSIDE, used_m=used_m)
         part, known = SomeRows(seen, near), {_OUTSIDE: outside}
