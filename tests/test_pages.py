@@ -34,6 +34,7 @@ PAGES = {
     "docs/objects.md": 1,
     "docs/pipelines.md": 4,
     "docs/train.md": 5,
+    "docs/why.md": 6,
 }
 
 
@@ -80,7 +81,7 @@ def folder(town, tmp_path, monkeypatch):
         [shapely.to_wkb(shapely.box(0, 0, 1, 1))],
     )
     where[0] = shapely.to_wkb(shapely.box(x, y, x + 9, y + 9))
-    for name, layer in (("lakes.gpkg", "lakes"), ("bridges.gpkg", "decks")):
+    for name, layer in (("lakes.gpkg", "lakes"), ("bridges.gpkg", "decks"), ("roof.gpkg", "roof")):
         how = {"geometry_type": "Polygon", "crs": "EPSG:25832", "layer": layer}
         pyogrio.raw.write(name, np.array(where, object), [np.zeros(1)], ["id"], **how)
     page = (ROOT / "docs" / "pipelines.md").read_text(encoding="utf-8")
@@ -88,6 +89,24 @@ def folder(town, tmp_path, monkeypatch):
     Path("train.json").write_text(train)
     Path("classify.json").write_text(classify)
     return tmp_path
+
+
+def prepare_why(folder):
+    """Make what docs/why.md reads: a classified cloud, and one that a person corrected."""
+    for name in ("hamlet.laz", "classified.laz"):
+        assert main(["classify", "raw.laz", name]) == 0
+    assert main(["classify", "survey/", "classified/"]) == 0
+    las = laspy.read("hamlet.laz")
+    codes = np.asarray(las.classification)
+    codes[np.flatnonzero(codes == 5)[:30]] = 6
+    las.classification = codes
+    las.write("corrected.laz")
+    x, y = float(np.median(las.x)), float(np.median(las.y))
+    pyogrio, shapely = pytest.importorskip("pyogrio"), pytest.importorskip("shapely")
+    point = np.array([shapely.to_wkb(shapely.Point(x, y))], object)
+    how = {"geometry_type": "Point", "crs": "EPSG:25832"}
+    pyogrio.raw.write("doubts.gpkg", point, [np.zeros(1)], ["id"], **how)
+    return {"652034.2": f"{x:.2f}", "6862010.8": f"{y:.2f}"}
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -101,6 +120,7 @@ def test_commands_run_as_printed(page, folder, environment, capsys, pdal_program
         stages[0], stages[2]["model"] = "survey/*.laz", "standard"
         stages[3]["filename"] = "own/c_#.laz"
         Path("classify.json").write_text(json.dumps(stages))
+    places = prepare_why(folder) if page == "docs/why.md" else {}
     for words in lines:
         if words[0] == "pdal":
             words[0] = str(pdal_program)
@@ -111,7 +131,7 @@ def test_commands_run_as_printed(page, folder, environment, capsys, pdal_program
         if page == "docs/train.md" and words[:2] == ["train", "tiles/*.laz"]:  # by the shell
             words[1:2] = ["tiles/0.laz", "tiles/1.laz"]
         words += QUICK if words[0] == "train" else []
-        words = ["64" if word == "500" else word for word in words]
+        words = [places.get(word, "64" if word == "500" else word) for word in words]
         assert main(words) == 0, (words, capsys.readouterr().err)
 
 
