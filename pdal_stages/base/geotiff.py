@@ -91,8 +91,8 @@ def _errors_named(path: str | Path = "") -> Iterator[None]:
     try:
         yield
     except rasterio().errors.RasterioError as error:
-        found = f"{path}: {error}" if path else str(error)
-        raise StageError("the raster could not be written", found=found) from error
+        seen = f"{path}: {error}" if path else str(error)
+        raise StageError("the raster could not be written", found=seen) from error
 
 
 def write_rasters(

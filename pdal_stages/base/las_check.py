@@ -163,10 +163,10 @@ def check_complete(
         )
 
 
-def _require(good: bool, what: str, found: str) -> None:
+def _require(good: bool, what: str, seen: str) -> None:
     """Refuse a file as damaged unless a condition holds."""
     if not good:
-        raise StageError(f"the LAS file is damaged: {what}", found=found, cure=CURE_OF_DAMAGE)
+        raise StageError(f"the LAS file is damaged: {what}", found=seen, cure=CURE_OF_DAMAGE)
 
 
 def _check_header(header: LasHeader, size: int) -> None:
@@ -174,24 +174,24 @@ def _check_header(header: LasHeader, size: int) -> None:
     h, kind = header, header.point_format
     _require(h.minor <= 5, "its version is not known", f"LAS 1.{h.minor}")
     _require(kind < len(POINT_BYTES), "its point format is not known", f"point format {kind}")
-    found = f"{h.point_bytes} bytes, format {kind} has {POINT_BYTES[kind]}"
-    _require(h.extra_bytes >= 0, "its points are shorter than their format", found)
+    seen = f"{h.point_bytes} bytes, format {kind} has {POINT_BYTES[kind]}"
+    _require(h.extra_bytes >= 0, "its points are shorter than their format", seen)
     least = _HEADER_BYTES[h.minor]
-    found = f"{h.header_bytes} bytes, LAS 1.{h.minor} has {least}"
-    _require(h.header_bytes >= least, "its header is too short", found)
-    found = f"header of {h.header_bytes} bytes, points at {h.offset}"
-    _require(h.header_bytes <= min(h.offset, size), "its points begin inside the header", found)
-    fit, found = (
+    seen = f"{h.header_bytes} bytes, LAS 1.{h.minor} has {least}"
+    _require(h.header_bytes >= least, "its header is too short", seen)
+    seen = f"header of {h.header_bytes} bytes, points at {h.offset}"
+    _require(h.header_bytes <= min(h.offset, size), "its points begin inside the header", seen)
+    fit, seen = (
         h.records * 54 <= h.offset - h.header_bytes,
         f"{h.records:,} records before the points",
     )
-    _require(fit, "it counts more records than there is room for", found)
+    _require(fit, "it counts more records than there is room for", seen)
     finite = all(_SMALLEST_SCALE <= abs(value) < math.inf for value in h.scales)
     finite &= all(abs(value) <= _LARGEST_OFFSET for value in h.offsets)
-    found = f"scales {h.scales}, offsets {h.offsets}"
-    _require(finite, "its scales or offsets are not valid numbers", found)
-    found = f"{size:,} bytes, points begin at {h.offset:,}"
-    _require(not h.count or h.offset <= size, "it is cut short", found)
+    seen = f"scales {h.scales}, offsets {h.offsets}"
+    _require(finite, "its scales or offsets are not valid numbers", seen)
+    seen = f"{size:,} bytes, points begin at {h.offset:,}"
+    _require(not h.count or h.offset <= size, "it is cut short", seen)
 
 
 def _check_records(file: BinaryIO, header: LasHeader, size: int) -> None:
@@ -200,9 +200,9 @@ def _check_records(file: BinaryIO, header: LasHeader, size: int) -> None:
     end = header.offset + (0 if header.compressed else header.count * header.point_bytes)
     if not count or end > size:  # of which the number of points tells
         return
-    found = f"{count:,} records at {header.after:,}, a file of {size:,} bytes"
+    seen = f"{count:,} records at {header.after:,}, a file of {size:,} bytes"
     there = end <= header.after <= size - 60 * count
-    _require(there, "the records after its points are not where it says", found)
+    _require(there, "the records after its points are not where it says", seen)
     whole = sum(r.after and r.data + r.length <= size for r in records(file, header))
     what = "the records after its points do not end within the file"
     _require(whole == count, what, f"{whole:,} of {count:,} do")
@@ -211,8 +211,8 @@ def _check_records(file: BinaryIO, header: LasHeader, size: int) -> None:
 def _check_count(file: BinaryIO, header: LasHeader, size: int) -> None:
     """Refuse a wrong number of uncompressed points."""
     held = max(0, end_of_points(header, size) - header.offset) // header.point_bytes
-    found = f"{held:,} whole points, its header counts {header.count:,}"
-    _require(held >= header.count, "it is cut short", found)
+    seen = f"{held:,} whole points, its header counts {header.count:,}"
+    _require(held >= header.count, "it is cut short", seen)
     _require_counted(header, held * header.point_bytes)
 
 
@@ -238,8 +238,8 @@ def _check_chunks(file: BinaryIO, header: LasHeader, size: int) -> None:
     if not header.count:  # an empty file may have 8 bytes
         end = table - 8 if inside else end_of_points(header, size)
         return _require_counted(header, end - begin)
-    found = f"{size:,} bytes, its table of chunks should be at {table:,}"
-    _require(inside, "it is cut short", found)
+    seen = f"{size:,} bytes, its table of chunks should be at {table:,}"
+    _require(inside, "it is cut short", seen)
     what = "it has no record of how it is compressed"
     _require(len(coding) >= 16, what, "no 'laszip encoded' among its records")
     _check_table(file, header, table, int.from_bytes(coding[12:16], "little"))
@@ -253,21 +253,21 @@ def _check_table(file: BinaryIO, header: LasHeader, table: int, chunk_points: in
     varies = chunk_points in (0, 2**32 - 1)
     room = table - header.offset - 8
     _require(not version, "its table of chunks is of an unknown version", str(version))
-    what, found = "its chunks are larger than any program makes them", f"{chunk_points:,} points"
-    _require(varies or chunk_points <= _LARGEST_CHUNK, what, found)
-    what, found = (
+    what, seen = "its chunks are larger than any program makes them", f"{chunk_points:,} points"
+    _require(varies or chunk_points <= _LARGEST_CHUNK, what, seen)
+    what, seen = (
         "it has more chunks than there is room for",
         f"{number:,} chunks in {room:,} bytes",
     )
-    _require(number * header.point_bytes <= room, what, found)  # a chunk begins with a whole point
+    _require(number * header.point_bytes <= room, what, seen)  # a chunk begins with a whole point
     if number > _MOST_CHUNKS:
         return
     sizes, counts = _decode_table(head + file.read(56 + 16 * number), varies)
     _require(
         bool(sizes) or not number, "it is cut short", f"its table of {number:,} chunks does not end"
     )
-    found = f"{sum(sizes):,} bytes in chunks, {room:,} bytes there"
-    _require(sum(sizes) == room, "its chunks do not fill the file", found)
+    seen = f"{sum(sizes):,} bytes in chunks, {room:,} bytes there"
+    _require(sum(sizes) == room, "its chunks do not fill the file", seen)
     held = sum(counts) if varies else number * chunk_points
     # Chunks of formats 6 and later begin with a point and their number of points.
     if not varies and header.point_format >= 6 and number:

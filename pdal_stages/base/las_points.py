@@ -209,8 +209,8 @@ class Layout:
         if header is None:
             raise StageError("the input is not a LAS or LAZ file", where=str(path))
         if header.point_format >= len(POINT_BYTES):
-            found = f"point format {header.point_format}"
-            raise StageError("its point format is not known", where=str(path), found=found)
+            seen = f"point format {header.point_format}"
+            raise StageError("its point format is not known", where=str(path), found=seen)
         data = description(path) if described is None else described
         return cls(header, tuple(extra_fields(header, data)), data)
 
@@ -309,8 +309,8 @@ def read_records(
         reason = error if isinstance(error, OSError) else reason
         raise StageError(what, where=str(path), found=reason) from None
     if at < end:
-        found = f"{at:,} of {end:,} points"
-        raise StageError("the input is cut short", where=str(path), found=found)
+        seen = f"{at:,} of {end:,} points"
+        raise StageError("the input is cut short", where=str(path), found=seen)
 
 
 def _parts(

@@ -143,12 +143,12 @@ def _name_wrong_line(
     for number, line in numbered:
         fields = line.split(delimiter)
         if len(fields) != len(names):
-            found = f"line {number:,}: {len(fields)} fields, {len(names)} dimensions"
+            seen = f"line {number:,}: {len(fields)} fields, {len(names)} dimensions"
             raise StageError(
-                "a line does not have a value for each dimension", found=found, cure=_HOW
+                "a line does not have a value for each dimension", found=seen, cure=_HOW
             )
         for name, text in zip(names, fields, strict=True):
             if not _NUMBER.fullmatch(text.strip()):
-                found = f"line {number:,}: {name} is {text.strip()!r}"
+                seen = f"line {number:,}: {name} is {text.strip()!r}"
                 cure = "Write numbers with a decimal point, without signs between digits"
-                raise StageError("a value is not a number", found=found, cure=cure)
+                raise StageError("a value is not a number", found=seen, cure=cure)

@@ -82,10 +82,10 @@ def run_stages(
     for each in ours:
         for name, kind in each.stage.creates().items():
             if name not in new and name != "Classification":
-                made = np.zeros(len(seen["X"]), number_type(kind))
+                values = np.zeros(len(seen["X"]), number_type(kind))
                 if name in columns:  # what the input has counts as a result of an earlier run
-                    made[:] = columns[name]
-                new[name] = made
+                    values[:] = columns[name]
+                new[name] = values
         each.function({"spatialreference": {"wkt": wkt}}, seen, new)
         if after is not None:
             after(each, seen)

@@ -48,8 +48,8 @@ def _unread_keys(path: str, header: LasHeader) -> str:
 
 
 def _waveforms(path: str, header: LasHeader) -> str:
-    found = f"{path}, point format {header.point_format}"
-    return found if header.point_format in WAVES else ""
+    seen = f"{path}, point format {header.point_format}"
+    return seen if header.point_format in WAVES else ""
 
 
 def _overwritten(path: str, header: LasHeader) -> str:
@@ -156,9 +156,9 @@ def check_inputs(stages: Sequence[StageJson]) -> None:
             if (header := header_there(path)) is None:
                 continue  # which reading it reports
             for fact in facts:
-                found = "" if stage.keys() & {*fact.unless} else fact.shows(path, header)
-                if found and (fact.until is None or pdal_env.version() < fact.until):
-                    raise PipelineError(fact.what, where=path, found=found, cure=fact.cure)
+                seen = "" if stage.keys() & {*fact.unless} else fact.shows(path, header)
+                if seen and (fact.until is None or pdal_env.version() < fact.until):
+                    raise PipelineError(fact.what, where=path, found=seen, cure=fact.cure)
             _compare_types(path, layout_there(path), types)
 
 

@@ -233,8 +233,8 @@ def _refuse_mixed_flags(points: Points, formats: Sequence[int]) -> None:
         return
     largest = int(points.arrays["Classification"].max(initial=0))
     if largest > LEGACY_LIMIT:
-        found = f"PDAL {pdal_env.dotted_version()}, Classification {largest}"
-        raise StageError(FLAGS_IN_CLASSES, found=found, cure=FLAGS_CURE)
+        seen = f"PDAL {pdal_env.dotted_version()}, Classification {largest}"
+        raise StageError(FLAGS_IN_CLASSES, found=seen, cure=FLAGS_CURE)
 
 
 def run_on_nothing(stage: Stage) -> Report:

@@ -77,15 +77,15 @@ def explain_points(
         xy = np.array([places[number][:2] for number in members])
         reach = _reach_that_fits(headers, xy, far)
         box = [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)]
-        around = Surroundings(files, box)
-        found = [around.nearest(places[number], unit) for number in members]
-        rows = np.array([row for row, _ in found])
-        recording = Recording(around, reference, request.where, rows)
+        cloud = Surroundings(files, box)
+        nearest = [cloud.nearest(places[number], unit) for number in members]
+        rows = np.array([row for row, _ in nearest])
+        recording = Recording(cloud, reference, request.where, rows)
         recording.run(pipeline)
         if reach < far:
             recording.notes.append(f"{_TOO_MANY} {reach * unit:.0f} m are not read")
         for at, number in enumerate(members):
-            out[number] = trace_point(recording, at, found[at][1], against)
+            out[number] = trace_point(recording, at, nearest[at][1], against)
     return [out[number] for number in range(len(places))]
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class AskedPlace(NamedTuple):
-    """Where a point is looked for, in the coordinates of the cloud."""
+    """A place at which a point is looked for, in the coordinates of the cloud."""
 
     x: float
     y: float
@@ -33,7 +33,7 @@ class FoundPoint:
 
 @dataclass(frozen=True)
 class Noise:
-    """Whether a point is noise, and why."""
+    """The verdict of the noise stage on a point."""
 
     code: int  #: 7, 18 or 0
     state: int  #: of :mod:`..terrain.detached`
@@ -41,7 +41,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class GroundSteps:
-    """What the steps of the ground filter made of a point and its cell; in meters.
+    """Results of the steps of the ground filter for a point and its cell; in meters.
 
     Elevations of the cell are relative to the point: -4.2 is 4.2 m below it.
     """
@@ -77,7 +77,7 @@ class PassInput:
 
 @dataclass(frozen=True)
 class PassTrace:
-    """What a pass of the model read of a point, and its probabilities."""
+    """The inputs of a pass of the model for a point, and its probabilities."""
 
     probabilities: Mapping[int, float]  #: by class, before priors
     start: Mapping[int, float]  #: before any input; empty where the learner cannot tell
@@ -86,7 +86,7 @@ class PassTrace:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the model said of a point."""
+    """The verdict of the model on a point."""
 
     model: str
     classes: Mapping[int, str]  #: names
@@ -101,7 +101,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Explanation:
-    """How a point came to its class."""
+    """All steps by which a point came to its class."""
 
     point: FoundPoint
     in_file: int  #: class

@@ -180,8 +180,8 @@ def _ground(ground: GroundSteps, no_noise: bool) -> list[str]:
             _row("look", "so few are that low: echoes from below the ground? Noise is left in")
         )
     if ground.is_given:
-        given = f"mean of classes 2, 9, 11 there: {_relative(ground.given)}"
-        out.append(_row("--ground given", given))
+        mean = f"mean of classes 2, 9, 11 there: {_relative(ground.given)}"
+        out.append(_row("--ground given", mean))
         high = (ground.given or 0.0) - (ground.lowest_near or 0.0)
         out.append(_row("lowest near", f"within 5 m: {_relative(ground.lowest_near)}"))
         if ground.given is not None and high > _HIGH_M:

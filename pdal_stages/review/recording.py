@@ -114,10 +114,10 @@ class Surroundings(LazyColumns):
 
         `unit` are the meters of a unit of the coordinates.
         """
-        found, asked = "no point at all", np.array([v for v in place[:3] if v is not None])
+        reason, target = "no point at all", np.array([v for v in place[:3] if v is not None])
         if len(self.number):
             xyz = np.column_stack([self[axis] for axis in "XYZ"])
-            away = unit * np.sqrt(((xyz[:, : len(asked)] - asked) ** 2).sum(axis=1))
+            away = unit * np.sqrt(((xyz[:, : len(target)] - target) ** 2).sum(axis=1))
             inside = np.flatnonzero(away <= place.doubtful_m)
             if len(inside) and "Reliability" in self:
                 row = int(inside[np.argmin(self["Reliability"][inside])])
@@ -126,16 +126,16 @@ class Surroundings(LazyColumns):
             spacing = 1.0 / np.sqrt(density(xyz[near] * unit)) if near.any() else 0.0
             if away[row] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing, place.doubtful_m):
                 return row, float(away[row])
-            found = f"the nearest is {away[row]:.1f} m away"
-            flat = unit * np.hypot(*(xyz[:, :2] - asked[:2]).T)
-            if len(asked) == 3 and flat.min() <= _FARTHEST_M:
-                found += (
+            reason = f"the nearest is {away[row]:.1f} m away"
+            flat = unit * np.hypot(*(xyz[:, :2] - target[:2]).T)
+            if len(target) == 3 and flat.min() <= _FARTHEST_M:
+                reason += (
                     f"; without Z {flat.min():.1f} m, at a height of {xyz[flat.argmin(), 2]:.2f}"
                 )
         raise StageError(
             "there is no point near this place",
-            where=" ".join(f"{value:.12g}" for value in asked),
-            found=found,
+            where=" ".join(f"{value:.12g}" for value in target),
+            found=reason,
             cure="Give X and Y in the cloud's reference system, or name theirs with --crs",
         )
 
@@ -146,9 +146,9 @@ PieceRasters = dict[str, tuple[GridWindow, NDArray[np.float32]]]
 
 @dataclass(eq=False)
 class Recording(Observer):
-    """What stages made of the points that are explained, as they tell it themselves."""
+    """Results of stages for the points that are explained, as the stages tell them."""
 
-    around: Surroundings
+    cloud: Surroundings
     reference: Reference
     where: str | None  #: condition of the points that are classified
     rows: NDArray[np.int64]  #: (m,) of the points in the surroundings
@@ -179,7 +179,7 @@ class Recording(Observer):
         for each in ours:
             each.update_context(observer=self)
         first = next(n for n, each in enumerate(ours) if isinstance(each.stage, ApplyModel))
-        columns, wkt = self.around, self.reference.wkt
+        columns, wkt = self.cloud, self.reference.wkt
         self.rows_seen = self.rows
         known = selection(self.where, columns)
         try:

@@ -47,7 +47,7 @@ def trace_point(
 
     `against` is the class that the one found is compared with, if the model has both.
     """
-    columns, row = recording.around, int(recording.rows[place])
+    columns, row = recording.cloud, int(recording.rows[place])
     codes = [int(columns["Classification"][row]), *(int(c[place]) for c in recording.classes)]
     after = {type(stage): code for stage, code in zip(recording.stages, codes[1:], strict=True)}
     model_at = next(n for n, s in enumerate(recording.stages) if isinstance(s, ApplyModel))
@@ -84,12 +84,12 @@ def trace_point(
 
 def _point(recording: Recording, row: int, distance_m: float) -> FoundPoint:
     """Return what the file has of a point."""
-    around = recording.around
+    cloud = recording.cloud
     names = ("X", "Y", "Z", "ReturnNumber", "NumberOfReturns")
-    x, y, z, number, returns = (around[name][row].item() for name in names)
-    checked = "Checked" in around and bool(around["Checked"][row])
-    file = around.files[around.file[row]]
-    return FoundPoint(file, int(around.number[row]), x, y, z, distance_m, number, returns, checked)
+    x, y, z, number, returns = (cloud[name][row].item() for name in names)
+    checked = "Checked" in cloud and bool(cloud["Checked"][row])
+    file = cloud.files[cloud.file[row]]
+    return FoundPoint(file, int(cloud.number[row]), x, y, z, distance_m, number, returns, checked)
 
 
 def _why_kept(recording: Recording, place: int, code: int) -> str:
@@ -100,7 +100,7 @@ def _why_kept(recording: Recording, place: int, code: int) -> str:
         Kept.GIVEN_GROUND: f"class {code} is given ground, which keeps its class",
         Kept.KEPT: f"class {code} is kept",
     }
-    if recording.around["Withheld"][recording.rows[place]]:
+    if recording.cloud["Withheld"][recording.rows[place]]:
         texts[Kept.IGNORED] = "it is withheld"
     return next((texts[reason] for reason in Kept if recording.kept[reason][place]), "")
 
@@ -113,7 +113,7 @@ def _ground(recording: Recording, place: int) -> GroundSteps | None:
     stage = next(s for s in recording.stages if isinstance(s, HagMorphological))
     number, column, line = (heights[name] for name in PLACED)
     piece, cell = recording.pieces[number], stage.cell
-    columns, row, units = recording.around, recording.rows[place], recording.reference.units
+    columns, row, units = recording.cloud, recording.rows[place], recording.reference.units
     z = float(columns["Z"][row]) * units.vertical
 
     def elevation(step: str, cells: int = 0) -> float | None:
@@ -173,7 +173,7 @@ def _verdict(recording: Recording, place: int, against: int) -> Verdict:
     for each in recording.inputs:
         if each.number not in by_pass and (rows := np.flatnonzero(each.rows == at)).size:
             by_pass[each.number] = _trace_pass(model, each, int(rows[0]))
-            xyz = [recording.around[axis][recording.rows[place]] for axis in "XYZ"]
+            xyz = [recording.cloud[axis][recording.rows[place]] for axis in "XYZ"]
             meters = np.array(xyz) * [units.horizontal, units.horizontal, units.vertical]
             away = float(np.linalg.norm(each.xyz[rows[0]] - meters))
             stands = away if away > 1e-5 else None

@@ -96,9 +96,9 @@ def compute_tile(cells: TileCells, tile: Tile, target: str) -> JsonObject:
     if window.width and window.height:
         terrain = _terrain(cells, window)
         reach = options.fill / cells.unit / options.resolution
-        around = window.padded(2 * math.ceil(reach) + 2)
-        inner = window.slices_in(around)
-        highest, below_wires = cells.highest(around)
+        wide = window.padded(2 * math.ceil(reach) + 2)
+        inner = window.slices_in(wide)
+        highest, below_wires = cells.highest(wide)
         top = solid = fill(highest, terrain, inner, reach)
         if not np.array_equal(highest, below_wires):
             solid = fill(below_wires, terrain, inner, reach)

@@ -176,8 +176,8 @@ def _density(
         }
     # Cells with points beside a void, by its number, and how many of them are water.
     beside = np.where(held > 0, ndimage.maximum_filter(label, 3), 0)
-    around, water = (np.bincount(beside[held >= least], minlength=count + 1) for least in (1, 2))
-    is_void = 2 * water < np.maximum(around, 1)
+    rim, water = (np.bincount(beside[held >= least], minlength=count + 1) for least in (1, 2))
+    is_void = 2 * water < np.maximum(rim, 1)
     is_void[0] = False
     sizes = np.bincount(label.ravel(), minlength=count + 1)[is_void] * cell_m**2
     middles = ndimage.center_of_mass(label > 0, label, np.flatnonzero(is_void))

@@ -159,7 +159,7 @@ def heights_at(
     x, y = centers
     west, south, east, north = bounds
     distance, out = near or NEAR * reach, np.full((len(y), len(x)), np.nan)
-    box = _around(centers, distance)
+    box = _widened(centers, distance)
     points = points_in(box)
     triangles = triangulate(points[:, :2])
     middle, radius = circles(points[:, :2], triangles)
@@ -177,14 +177,14 @@ def heights_at(
         split = partial(_groups, width=2 * int(distance / step) + 1, most=room / step)
         for rows, columns in split(is_open):
             part = x[columns], y[rows]
-            is_open[rows, columns] &= _in_hull(part, points_in(_around(part, reach)))
+            is_open[rows, columns] &= _in_hull(part, points_in(_widened(part, reach)))
         for rows, columns in split(is_open):
             part, farther = (x[columns], y[rows]), min(3 * distance, reach)
             out[rows, columns] = heights_at(part, reach, bounds, points_in, farther, widest)
     return out
 
 
-def _around(centers: tuple[NDArray[np.float64], NDArray[np.float64]], distance: float) -> Box:
+def _widened(centers: tuple[NDArray[np.float64], NDArray[np.float64]], distance: float) -> Box:
     """Return the box that reaches a distance beyond the centers of cells."""
     x, y = centers
     return x[0] - distance, y[0] - distance, x[-1] + distance, y[-1] + distance

@@ -161,10 +161,10 @@ def find_detached(
         if not (scale == number).any():
             continue
         least = np.where(voxels <= RULES.max_line_voxels, RULES.min_around, sparse)
-        found = _judge(keys, counts, company >= least, most, frame, threads)
+        states = _judge(keys, counts, company >= least, most, frame, threads)
         detached = np.zeros((keys[-1] >> BITS) + 1, np.bool_)
-        detached[keys[found > SOLID] >> BITS] = True
-        known = frame, (scale == number).ravel(), detached, keys, found
+        detached[keys[states > SOLID] >> BITS] = True
+        known = frame, (scale == number).ravel(), detached, keys, states
 
         def assign(share, known=known):
             _assign(_share(points, share), state[share], *known)
@@ -204,9 +204,9 @@ def _count(
     """Return the keys (n,) of the voxels of points in the blocks `near`, and how many they hold."""
 
     def count(share):
-        some = _share(points, share)
-        keys, counts = np.empty((2, len(some.x)), np.int64)
-        number = _keys(some, frame, near, keys, counts)
+        part = _share(points, share)
+        keys, counts = np.empty((2, len(part.x)), np.int64)
+        number = _keys(part, frame, near, keys, counts)
         return _sum_by_key(keys[:number], counts[:number])
 
     parts = list(map_blocks(count, _slices(len(points.x)), threads))

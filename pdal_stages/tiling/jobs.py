@@ -195,13 +195,13 @@ def _shared_points(tiles: Sequence[Job]) -> list[str]:
     """Return a message about the pair of inputs that share most points, if any do."""
     pairs: Counter[tuple[str, str]] = Counter()
     for job in tiles:
-        for one, other, count in job.record.get("shared", []):
-            pairs[one, other] += count
+        for path, other, count in job.record.get("shared", []):
+            pairs[path, other] += count
     more = f" (so do {len(pairs) - 1:,} more pairs of files)" if len(pairs) > 1 else ""
     return [
-        f"{one} and {other} both hold {count_of(count, 'point')} at the same place and time{more}: "
-        "all are written, but points look twice as dense there; leave one of the two out"
-        for (one, other), count in pairs.most_common(1)
+        f"{first} and {other} both hold {count_of(count, 'point')} at the same place and time"
+        f"{more}: all are written, but points look twice as dense there; leave one of the two out"
+        for (first, other), count in pairs.most_common(1)
     ]
 
 

@@ -113,8 +113,8 @@ class RecordRun(SurveyRun):
         waiting = self._without_arrays(jobs)
         self.read_inputs({source.path for job in waiting for source in near[job.tile]})
         if faults := survey.faults:  # a result would have holes
-            found = "; ".join(f"{path}: {why}" for path, why in [*faults.items()][:_MOST_REASONS])
-            raise StageError(f"{len(faults)} of the inputs cannot be read", found=found)
+            seen = "; ".join(f"{path}: {why}" for path, why in [*faults.items()][:_MOST_REASONS])
+            raise StageError(f"{len(faults)} of the inputs cannot be read", found=seen)
 
         def task_of(job: Job) -> Callable[[], Any]:
             sources = near[job.tile]
