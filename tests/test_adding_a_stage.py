@@ -60,7 +60,8 @@ def env(tmp_path):
     """Return an environment in which Python finds packages in the folder site."""
     (tmp_path / "site").mkdir()
     programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    return {"PYTHONPATH": str(tmp_path / "site"), "PATH": programs}
+    packages = os.pathsep.join([str(tmp_path / "site"), str(ROOT)])
+    return {"PYTHONPATH": packages, "PATH": programs}
 
 
 @pytest.fixture(params=[in_this_package, in_another_package])

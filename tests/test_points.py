@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pdal_stages.base.errors import DimensionError
+from pdal_stages.stages.bridges import Bridges
 from pdal_stages.stages.points import Points
 
 
@@ -30,8 +31,8 @@ def test_what_is_not_kept_is_let_go_of_and_coordinates_stay():
     with pytest.raises(DimensionError, match="GpsTime"):
         points.dimension("GpsTime")
     assert np.array_equal(points.take_xyz(), np.column_stack([columns[name] for name in "XYZ"]))
-    points.tally("all", np.ones(1000, bool))
-    assert points.report.figures["all"] == 1000
+    points.tally(Bridges.decks, np.ones(1000, bool))
+    assert points.report.figures["decks"] == points.report.counts[Bridges.decks] == 1000
 
 
 @pytest.mark.parametrize("scale", [0.01, 0.001, 0.00025])

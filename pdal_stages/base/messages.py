@@ -63,12 +63,29 @@ class PlainStream:
         return getattr(self.stream, name)
 
 
+class Count:
+    """A number of points that a stage reports; an attribute of its class, which names it.
+
+    Tiles add it up, and `classify` prints it.
+    """
+
+    name: str
+
+    def __init__(self, words: str) -> None:
+        self.words = words  #: which points these are
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Take the attribute's name."""
+        self.name = name
+
+
 @dataclass
 class Report:
     """Counts, notes and warnings of a run."""
 
     #: JSON-able values by name, e.g. ``points`` or ``classes``
     figures: JsonObject = field(default_factory=dict)
+    counts: dict[Count, int] = field(default_factory=dict)  #: which are among the figures, too
     notes: list[str] = field(default_factory=list)  #: what the user should know; nothing is wrong
     warnings: list[str] = field(default_factory=list)  #: what is likely wrong, and the cure
     #: By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile
@@ -81,7 +98,7 @@ class Report:
     def merge(self, other: Report) -> None:
         """Merge another report into this one. Existing figures stay; dicts are merged by key.
 
-        ``codes`` are not merged: those of the last stage count, which its own report holds.
+        ``counts`` and ``codes`` are not merged: they are those of a stage's own report.
         """
         _merge(self.figures, other.figures)
         _merge(self.beyond_halo, other.beyond_halo)

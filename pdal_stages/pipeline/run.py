@@ -102,14 +102,14 @@ class Pipeline:
 
     @property
     def point_counts(self) -> dict[str, int]:
-        """Counts of points of the last run (:attr:`Stage.counts`) above 0, by ``type.name``.
+        """Counts of the last run (:class:`.messages.Count`) above 0, by ``type.name``.
 
         They are sums over views, and over stages of one type.
         """
         counts = Counter[str]()
         for ours in self.expanded.ours:
-            for name in ours.stage.counts:
-                numbers = [report.figures.get(name, 0) for report in ours.reports]
+            for name, count in ours.stage.counts().items():
+                numbers = [report.counts.get(count, 0) for report in ours.reports]
                 counts[f"{ours.stage.type}.{name}"] += sum(numbers)
         return dict(+counts)
 

@@ -29,6 +29,7 @@ from ..base.dimensions import (
 )
 from ..base.errors import OptionError
 from ..base.json_types import StageJson
+from ..base.messages import Count
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, is_too_flat, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
@@ -63,12 +64,10 @@ class ApplyModel(Stage, settings=PredictionOptions):
     where_help = "Points outside keep their class but still serve as neighbors"
     forgets = True
     costly = True
-    counts = {
-        "rejected": "rejected as unreliable",
-        "ignored": "noise and withheld points, not classified (ignore)",
-        "kept": "class kept (keep)",
-        "outside_where": "outside where",
-    }
+    rejected = Count("rejected as unreliable")
+    ignored = Count("noise and withheld points, not classified (ignore)")
+    kept = Count("class kept (keep)")
+    outside_where = Count("outside where")
     model_file: str = option(
         "model",
         None,
@@ -254,7 +253,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
             alone = (~inside, ignored, is_terrain, kept)
             context.observer.see_kept(dict(zip(Kept, alone, strict=True)))
         kept = kept | is_terrain
-        points.tally("kept", inside & kept & ~ignored)
+        points.tally(self.ignored, inside & ignored)
+        points.tally(self.kept, inside & kept & ~ignored)
         wanted = inside & ~ignored & ~kept
         dimensions = {
             n: points.arrays[n] for n in self.model.optional_dimensions if n in points.arrays
@@ -292,9 +292,9 @@ class ApplyModel(Stage, settings=PredictionOptions):
             values[self.mark] = inside
         values["Classification"] = points.with_codes(codes)
         if self.reject_below is not None or self.limits is not None:
-            points.tally("rejected", rejected)
+            points.tally(self.rejected, rejected)
         points.report.merge(prediction.report)
-        points.tally("outside_where", ~inside)
+        points.tally(self.outside_where, ~inside)
         return values
 
     def _columns(self, points: Points, prediction: Prediction) -> dict[str, NDArray]:

@@ -17,6 +17,7 @@ from ..base.errors import StageError
 from ..base.files import Output, check_writable
 from ..base.grid import GridWindow
 from ..base.json_types import JsonObject, StageJson
+from ..base.messages import Count
 from ..base.options import Option, decode_options, option, option_of, parse_options
 from ..base.units import named_unit
 from ..classifier.interface import ModelObserver
@@ -115,9 +116,10 @@ class Stage(ABC):
 
     A subclass declares its type, a summary and its options in its body, describes what it reads
     and creates and how far it looks, and does the work in :meth:`run`. Options are attributes. What
-    is costly to derive from them (a plan, a model) is a ``functools.cached_property``. A stage
-    cannot be changed after it is made. ``class Mine(Stage, settings=MySettings)`` makes the fields
-    of a dataclass of :class:`..base.checks.Settings` options, too.
+    is costly to derive from them (a plan, a model) is a ``functools.cached_property``, and numbers
+    of points that it reports are :class:`..base.messages.Count`. A stage cannot be changed after it
+    is made. ``class Mine(Stage, settings=MySettings)`` makes the fields of a dataclass of
+    :class:`..base.checks.Settings` options, too.
 
     Parameters
     ----------
@@ -158,9 +160,6 @@ class Stage(ABC):
     in_models: ClassVar[tuple[str, ...]] = ()
     #: Raise it when the results change: models that were trained with another one warn.
     algorithm_version: ClassVar[int] = 1
-    #: Counts that it puts into its report (:meth:`Points.tally`): name -> what these points are.
-    #: Tiles add them up, and `classify` prints them.
-    counts: ClassVar[Mapping[str, str]] = {}
     #: Options of the example on its page; needed where an option is required.
     example: ClassVar[JsonObject] = {}
     #: Whether it calls :meth:`Points.keep_only`: the next stage gets the points from PDAL anew.
@@ -233,6 +232,12 @@ class Stage(ABC):
         where = options["where"]
         options["where"] = replace(where, help=f"{where.help}. {cls.where_help}")
         return tuple(reversed(options.values()))
+
+    @classmethod
+    def counts(cls) -> dict[str, Count]:
+        """Return the counts that it may report, by name."""
+        bodies = [vars(kind).items() for kind in reversed(cls.__mro__)]
+        return {name: each for body in bodies for name, each in body if isinstance(each, Count)}
 
     @classmethod
     def complete(cls, raw_options: dict[str, Any]) -> JsonObject:

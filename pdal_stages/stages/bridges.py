@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import BRIDGE, TOWER, WIRE
+from ..base.messages import Count
 from ..structures.decks import RULES, find_decks
 from .base import ClassStage, StageContext
 from .options import Selection, code_option, keep_option
@@ -24,7 +25,7 @@ class Bridges(ClassStage):
         "after Sithole, Vosselman 2006, ISPRS Journal of Photogrammetry and Remote Sensing 61(1), "
         "33-46"
     )
-    counts = {"decks": "bridge decks (bridges)"}
+    decks = Count("bridge decks (bridges)")
     code: int = code_option(BRIDGE, "Class code of bridge decks")
     keep: Selection = keep_option()
     reads_around = frozenset({"Ground"})
@@ -50,7 +51,7 @@ class Bridges(ClassStage):
         codes = before.copy()
         codes[deck] = self.code
         figures = points.report.figures
-        points.tally("decks", deck)
+        points.tally(self.decks, deck)
         figures["left"] = class_counts(before[deck & (before != self.code)])
         figures["classes"] = class_counts(codes[free])
         return {"Classification": points.with_codes(codes)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from numpy.typing import NDArray
 
 from ..base.asprs import NOISE
+from ..base.messages import Count
 from ..terrain.noise import REACH, judge_noise
 from .base import ClassStage, StageContext
 from .options import option
@@ -17,7 +18,8 @@ class DetachedNoise(ClassStage):
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
     algorithm_version = 4
-    counts = {"low": "marked as low noise", "high": "marked as high noise"}
+    low = Count("marked as low noise")
+    high = Count("marked as high noise")
     reads_around = frozenset()  # classes alone, by `ignore`
     cluster: int = option(
         "integer",
@@ -64,8 +66,8 @@ class DetachedNoise(ClassStage):
             noise[~points.mask] = 0
         codes = points.class_codes.copy()
         codes[noise != 0] = noise[noise != 0]
-        for code, name in zip(NOISE, ("low", "high"), strict=True):
-            points.tally(name, noise == code)
+        for code, count in zip(NOISE, (self.low, self.high), strict=True):
+            points.tally(count, noise == code)
         if noise.any():
             points.report.figures["classes"] = class_counts(codes[noise != 0])
         return {"Classification": points.with_codes(codes)}

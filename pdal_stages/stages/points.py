@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.dimensions import is_height
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.messages import Report, shorten
+from ..base.messages import Count, Report, shorten
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .options import Selection
 from .where_expression import Expression
@@ -95,11 +95,15 @@ class Points:
         """Return which points (n,) lie inside `where`; all without one."""
         return np.ones(self.count, bool) if self.mask is None else self.mask
 
-    def tally(self, name: str, points: NDArray[np.bool_]) -> None:
+    def tally(self, count: Count, points: NDArray[np.bool_]) -> None:
         """Report the number of these points (n,), in a tile without its surroundings."""
+        number = self._number(points)
+        self.report.counts[count] = self.report.figures[count.name] = number
+
+    def _number(self, points: NDArray[np.bool_]) -> int:
+        """Return the number of these points (n,), in a tile without its surroundings."""
         outside = self.meters_outside
-        inside = points if outside is None else points & (outside < 0)
-        self.report.figures[name] = int(np.count_nonzero(inside))
+        return int(np.count_nonzero(points if outside is None else points & (outside < 0)))
 
     @cached_property
     def units(self) -> Units:
@@ -267,7 +271,8 @@ class Points:
     def ignored(self, selection: Selection) -> NDArray[np.bool_]:
         """Return which points (n,) a selection takes; report how many lie inside `where`."""
         chosen = self.chosen(selection)
-        self.tally("ignored", chosen if self.mask is None else chosen & self.mask)
+        inside = chosen if self.mask is None else chosen & self.mask
+        self.report.figures["ignored"] = self._number(inside)
         return chosen
 
     def usable(self, ignored: Selection) -> NDArray[np.bool_]:

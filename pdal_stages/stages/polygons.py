@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.messages import Count
 from ..base.vector import Overlay, inside_of, with_vector
 from .base import ClassStage, StageContext
 from .options import Selection, ignore_option, keep_option, option
@@ -19,7 +20,7 @@ class Polygons(ClassStage):
         "Set the class of points inside the polygons of any OGR file, such as water inside lakes"
     )
     where_help = "Points outside keep their class"
-    counts = {"inside": "points inside polygons (polygons)"}
+    inside = Count("points inside polygons (polygons)")
     polygons: list = option(
         "list",
         None,
@@ -67,7 +68,7 @@ class Polygons(ClassStage):
             if not polygons:
                 points.report.warnings.append(f"{NO_POLYGON_NEAR} {name}")
         points.report.figures["polygons"] = counts
-        points.tally("inside", changed)
+        points.tally(self.inside, changed)
         points.report.figures["classes"] = class_counts(codes[change])
         points.report.notes += notes
         return {"Classification": points.with_codes(codes)}

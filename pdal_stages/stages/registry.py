@@ -117,9 +117,9 @@ def stage_type(name: str) -> type[Stage]:
 
 
 def describe_count(name: str) -> str:
-    """Return what a count of a stage means (:attr:`Stage.counts`), from ``type.name``."""
+    """Return the words of a count of a stage, from ``type.name``."""
     kind, _, count = name.rpartition(".")
-    return stage_type(kind).counts[count]
+    return stage_type(kind).counts()[count].words
 
 
 def place(type_name: str, tag: str | None) -> str:

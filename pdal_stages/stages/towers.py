@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..base.asprs import TOWER, WIRES
 from ..base.dimensions import HEIGHT
+from ..base.messages import Count
 from ..structures.towers import RULES, find_towers
 from .base import ClassStage, StageContext
 from .options import Selection, code_option, keep_option
@@ -18,7 +19,7 @@ class Towers(ClassStage):
 
     type = "filters.towers"
     summary = "Classify towers and poles, by the wires that they hold"
-    counts = {"towers": "points of towers (towers)"}
+    towers = Count("points of towers (towers)")
     code: int = code_option(TOWER, "Class code of towers")
     keep: Selection = keep_option()
 
@@ -46,6 +47,6 @@ class Towers(ClassStage):
             tower[:] = False
         codes = before.copy()
         codes[tower] = self.code
-        points.tally("towers", tower)
+        points.tally(self.towers, tower)
         points.report.figures["left"] = class_counts(before[tower & (before != self.code)])
         return {"Classification": points.with_codes(codes)}
