@@ -67,10 +67,11 @@ Observe = Callable[[PassInputs], None]
 class ClassStep(Enum):
     """Steps in which classified points get their class, in this order."""
 
-    LIKELIEST = 1
+    LIKELIEST = 1  #: of classes of lines none, where a point can be anything else
     GIVEN_GROUND = 2  #: what is too far from given ground gets its second class
-    SURENESS = 3  #: what is not sure enough loses its class
-    HEIGHTS = 4  #: low and medium vegetation
+    LINES = 3  #: what lies on a line gets the class of lines
+    SURENESS = 4  #: what is not sure enough loses its class
+    HEIGHTS = 5  #: low and medium vegetation
 
 
 class ModelObserver(Protocol):

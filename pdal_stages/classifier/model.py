@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any, cast
 
 import numpy as np
@@ -26,7 +26,6 @@ from .feature_forest import FeatureEstimator
 from .input_dimensions import list_values, optional_dimensions, required_dimensions
 from .interface import (
     BatchEstimator,
-    Block,
     ClassStep,
     Estimator,
     InputPlan,
@@ -35,8 +34,11 @@ from .interface import (
     classifier_of,
     preprocessing,
 )
+from .line_evidence import REACH, find_lines
 from .model_info import ModelInfo
 from .prediction import (
+    LineCandidates,
+    Locate,
     PointRoles,
     Prediction,
     PredictionOptions,
@@ -46,8 +48,9 @@ from .prediction import (
     empty_columns,
     move_from_ground,
     reject,
+    set_lines_aside,
+    settle_lines,
 )
-from .straight_lines import REACH, keep_to_lines
 
 #: How many times sparser or denser than those trained on a cloud may be without a warning (not
 #: tuned).
@@ -123,13 +126,23 @@ class Model:
 
     @property
     def lines(self) -> npt.NDArray[np.bool_]:
-        """(classes,) whose points must lie on a line of such points, see :mod:`.straight_lines`."""
+        """(classes,) whose points must lie on a line, see :mod:`.line_evidence`."""
         return np.isin(self.codes, self.info.get("lines", ()))
 
     @property
     def halo_m(self) -> float:
         """Meters around a tile whose points the tile's results depend on."""
-        return self.plan.halo_m + self.voxel + REACH * bool(self.lines.any())
+        return self.reach_m + self.reach_of_lines_m
+
+    @property
+    def reach_m(self) -> float:
+        """Meters around a tile whose points the tile's probabilities depend on."""
+        return self.plan.halo_m + self.voxel
+
+    @property
+    def reach_of_lines_m(self) -> float:
+        """Meters around a tile whose probabilities decide what lies on a line there."""
+        return REACH if self.lines.any() else 0.0
 
     @property
     def gives_variance(self) -> bool:
@@ -244,7 +257,8 @@ class Model:
         xyz = check_xyz(xyz)
         roles = PointRoles.check(len(xyz), where, ignore, current, may_be_ground)
         how = PredictionOptions(**options)
-        return self.classify(xyz, dict(dimensions or {}), roles, how, progress)
+        prediction = self.classify(xyz, dict(dimensions or {}), roles, how, progress)
+        return self.finish(prediction, roles.wanted, how, xyz.__getitem__, roles.current)
 
     def classify(
         self,
@@ -254,7 +268,7 @@ class Model:
         how: PredictionOptions,
         progress: Progress | None = None,
     ) -> Prediction:
-        """Classify a cloud as :meth:`predict` does, which explains the parameters.
+        """Return the classes of a cloud before :meth:`finish`; parameters are of :meth:`predict`.
 
         Coordinates (n, 3) that the caller does not hold are freed before most memory is taken.
         """
@@ -262,7 +276,7 @@ class Model:
             raise OptionError("only a network gives a variance", cure="Ask for the margin")
         xyz = check_xyz(xyz)
         dimensions = self._add_preprocessed(xyz, dimensions, roles, how.threads)
-        columns = empty_columns(roles, len(self.classes), how)
+        columns = empty_columns(roles, len(self.classes), how, bool(self.lines.any()))
         values = list_values(self.plan.dimensions, dimensions, len(xyz), roles.usable)
         wanted_rows = roles.wanted_rows
         representatives = represent(xyz, self.voxel, values, wanted_rows, roles.usable)
@@ -291,12 +305,54 @@ class Model:
             request.report.figures["too_far_for_ground"] = move_from_ground(columns, roles)
             if how.observer is not None:
                 how.observer.see_classes(ClassStep.GIVEN_GROUND, columns["classification"])
-        if len(work.xyz) < len(roles.wanted) - roles.ignored:
+        count = len(roles.wanted)
+        if len(work.xyz) < count - roles.ignored:
             request.report.figures["representatives"] = len(work.xyz)
-        rejected = reject(columns, roles, how)
-        report = Report(count_classes(columns["classification"], roles, len(rejected)))
+        unwanted = count - roles.ignored - int(np.count_nonzero(roles.wanted))
+        ignored = {"ignored": roles.ignored} if roles.ignored else {}
+        report = Report({"points": count, "outside_where": unwanted, **ignored})
         report.merge(request.report)
-        return Prediction(**columns, unsure=rejected, report=report)
+        candidates = None
+        if "line_class" in columns:
+            names = ("line_probability", "line_class")
+            candidates = LineCandidates(*(columns.pop(name) for name in names))
+        return Prediction(**columns, report=report, candidates=candidates)
+
+    def finish(
+        self,
+        prediction: Prediction,
+        wanted: npt.NDArray[np.bool_],
+        how: PredictionOptions,
+        locate: Locate | None,
+        current: npt.NDArray[np.uint8] | None,
+    ) -> Prediction:
+        """Return a prediction in which lines are found and what is not reliable is rejected.
+
+        Arrays of `prediction` are changed.
+
+        Parameters
+        ----------
+        prediction : Prediction
+        wanted : (n,) bool
+            Points that are finished.
+        how : PredictionOptions
+        locate : callable or None
+            Returns where points lie. None: lines are not looked for.
+        current : (n,) uint8 or None
+            Class codes that rejected points keep.
+        """
+        candidates = prediction.candidates
+        if candidates is not None and locate is not None:
+            rows = np.flatnonzero(candidates.chosen)
+            shares = candidates.probability[rows]
+            on_line = find_lines(locate(rows), shares, how.threads)
+            settle_lines(prediction, rows[on_line], self.codes)
+            if how.observer is not None:
+                how.observer.see_classes(ClassStep.LINES, prediction.classification)
+        rejected = reject(prediction, wanted, current, how)
+        report = Report(count_classes(prediction.classification, wanted, len(rejected)))
+        report.merge(prediction.report)
+        return replace(prediction, unsure=rejected, report=report)
 
     def _add_preprocessed(
         self,
@@ -316,13 +372,6 @@ class Model:
         )
         return dimensions if computed.keys() & dimensions.keys() else {**computed, **dimensions}
 
-    def _blocks(self, request: PredictRequest) -> Iterator[Block]:
-        """Yield the probabilities of the wanted points, block by block."""
-        blocks = partial(classify, self.weighted_passes)
-        if not self.lines.any():
-            return blocks(request)
-        return keep_to_lines(blocks, request, self.lines)
-
     def _classify(
         self,
         work: WorkingCloud,
@@ -334,9 +383,14 @@ class Model:
 
         Warns where the cloud is not as dense as those that the model was trained on.
         """
-        for block in self._blocks(request):
+        has_lines = bool(self.lines.any())
+        for block in classify(self.weighted_passes, request):
             rows_in_cloud, rows_in_block = work.members(block.rows)
-            for name, values in decide(block, self.codes, columns).items():
+            new: dict[str, npt.NDArray] = {}
+            if has_lines:
+                block, new = set_lines_aside(block, self.lines, self.codes)
+            new |= decide(block, self.codes, columns)
+            for name, values in new.items():
                 columns[name][rows_in_cloud] = values[rows_in_block]
             if progress is not None and work.stands_for_others:
                 progress.update(len(rows_in_cloud))

@@ -7,8 +7,8 @@ was given, ``rows_in_work`` of the points that are computed (:class:`WorkingClou
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from ..features.point_grid import CellGrid, build_grid
 from ..features.voxels import Members, Representatives
 from .calibration import ReliabilityLimits
 from .interface import Block, ClassStep, ModelObserver, Observe, PassInputs
+from .line_evidence import RULES
 
 
 @dataclass(frozen=True)
@@ -67,19 +68,40 @@ class PredictionOptions(Settings):
     observer: ModelObserver | None = None
 
 
+#: Returns where points lie (m, 3), in meters, by their rows (m,).
+Locate = Callable[[npt.NDArray[np.int64]], npt.NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class LineCandidates:
+    """Points of a cloud that may be part of lines, such as wires; other points have 0."""
+
+    probability: npt.NDArray[np.float32]  #: (n,) of the classes of lines together
+    code: npt.NDArray[np.uint8]  #: (n,) the likeliest of these classes
+
+    @property
+    def chosen(self) -> npt.NDArray[np.bool_]:
+        """Return which points (n,) are candidates."""
+        return self.probability > 0
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """Classes of a cloud's points, in its order, with 0 for points that were not classified."""
 
     classification: npt.NDArray[np.uint8]  #: (n,) ASPRS codes
     reliability: npt.NDArray[np.float32]  #: (n,) probability of the winning class
-    unsure: npt.NDArray[np.int64]  #: (m,) points that were not reliable enough, and so rejected
     report: Report  #: counts, notes and warnings for the metadata
+    #: (m,) points that were not reliable enough, and so rejected
+    unsure: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     margin: npt.NDArray[np.float32] | None = None  #: (n,) winning minus second probability
     #: (n,) variance of a class's probability over a network's batches, mean over the classes
     variance: npt.NDArray[np.float32] | None = None
     #: (n, classes) in the order of ``Model.classes``
     probabilities: npt.NDArray[np.float32] | None = None
+    #: of a model with classes of lines, until these are found: everything else is what holds if
+    #: none of them lies on a line
+    candidates: LineCandidates | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,9 +238,12 @@ class WorkingCloud:
 
 
 def empty_columns(
-    roles: PointRoles, classes: int, options: PredictionOptions
+    roles: PointRoles, classes: int, options: PredictionOptions, lines: bool
 ) -> dict[str, npt.NDArray]:
-    """Return the columns (n, ...) of results before any point is classified."""
+    """Return the columns (n, ...) of results before any point is classified.
+
+    `lines`: some classes are of lines.
+    """
     n, current = len(roles.wanted), roles.current
     columns: dict[str, npt.NDArray] = {
         "classification": np.zeros(n, np.uint8) if current is None else current.copy(),
@@ -231,7 +256,34 @@ def empty_columns(
         columns["probabilities"] = np.zeros((n, classes), np.float32)
     if roles.not_ground is not None:
         columns["second"], columns["second_share"] = np.zeros(n, np.uint8), np.zeros(n, np.float32)
+    if lines:
+        columns["line_probability"] = np.zeros(n, np.float32)
+        columns["line_class"] = np.zeros(n, np.uint8)
     return columns
+
+
+def set_lines_aside(
+    block: Block, lines: npt.NDArray[np.bool_], codes: npt.NDArray[np.uint8]
+) -> tuple[Block, dict[str, npt.NDArray]]:
+    """Return a block as if none of its points lay on a line, and the columns of candidates (b,).
+
+    `lines` (classes,) tells which classes are lines. A point that can be nothing else stays one.
+    """
+    p = block.probabilities
+    of_lines = p[:, lines].sum(axis=1)
+    rest = p[:, ~lines].sum(axis=1)
+    share = of_lines.astype(np.float32)
+    likeliest = codes[lines][p[:, lines].argmax(axis=1)]
+    candidate = share >= np.float32(RULES.candidate)
+    columns = {
+        "line_probability": np.where(candidate, share, np.float32(0.0)),
+        "line_class": np.where(candidate, likeliest, np.uint8(0)),
+    }
+    change = np.flatnonzero(candidate & (rest > 0))
+    if len(change):
+        p = p.copy()
+        p[change] = np.where(lines, 0.0, p[change] / rest[change, None])
+    return block._replace(probabilities=p), columns
 
 
 def decide(
@@ -270,19 +322,49 @@ def move_from_ground(columns: dict[str, npt.NDArray], roles: PointRoles) -> int:
     return len(rows)
 
 
+def settle_lines(
+    prediction: Prediction,
+    on_line: npt.NDArray[np.int64],
+    codes: npt.NDArray[np.uint8],
+) -> None:
+    """Give points on a line, by their rows (m,), the class of lines.
+
+    They are of it with a probability halfway between what the passes gave them and 1; the other
+    classes share the rest as before. `codes` (classes,) are in the order of probabilities.
+    """
+    candidates = prediction.candidates
+    assert candidates is not None
+    code = candidates.code[on_line]
+    share = np.float32(0.5) * (np.float32(1.0) + candidates.probability[on_line])
+    prediction.classification[on_line] = code
+    if prediction.margin is not None:
+        second = (np.float32(1.0) - share) * prediction.reliability[on_line]
+        prediction.margin[on_line] = share - second
+    prediction.reliability[on_line] = share
+    if prediction.probabilities is not None:
+        prediction.probabilities[on_line] *= (np.float32(1.0) - share)[:, None]
+        prediction.probabilities[on_line, np.searchsorted(codes, code)] = share
+
+
 def reject(
-    columns: dict[str, npt.NDArray], roles: PointRoles, options: PredictionOptions
+    prediction: Prediction,
+    wanted: npt.NDArray[np.bool_],
+    current: npt.NDArray[np.uint8] | None,
+    options: PredictionOptions,
 ) -> npt.NDArray[np.int64]:
-    """Take the class from points that are not reliable enough; return their rows in the cloud."""
-    code = columns["classification"]
+    """Take the class from wanted points (n,) that are not reliable enough; return their rows.
+
+    `current` (n,) are the classes that they had.
+    """
+    code = prediction.classification
     if options.limits is None and not options.reject_below:
         return np.zeros(0, np.int64)
     least = np.full(256, options.reject_below or 0.0, np.float32)
     if options.limits is not None:
         np.maximum(least, options.limits.least_reliability(), out=least)
     limit = least[code]
-    rows = np.flatnonzero(roles.wanted & (columns["reliability"] < limit))
-    kept = UNCLASSIFIED if roles.current is None else roles.current[rows]
+    rows = np.flatnonzero(wanted & (prediction.reliability < limit))
+    kept = UNCLASSIFIED if current is None else current[rows]
     code[rows] = kept if options.rejected_code is None else options.rejected_code
     if options.observer is not None:
         options.observer.see_classes(ClassStep.SURENESS, code, limit)
@@ -290,16 +372,12 @@ def reject(
 
 
 def count_classes(
-    classification: npt.NDArray[np.uint8], roles: PointRoles, rejected: int
+    classification: npt.NDArray[np.uint8], wanted: npt.NDArray[np.bool_], rejected: int
 ) -> JsonObject:
-    """Return the counts of a prediction, for its report."""
-    n, wanted = len(roles.wanted), int(np.count_nonzero(roles.wanted))
-    number = np.bincount(classification[roles.wanted], minlength=256)
+    """Return the counts of wanted points (n,) of a prediction, for its report."""
+    number = np.bincount(classification[wanted], minlength=256)
     return {
-        "points": n,
-        "classified": wanted - rejected,
+        "classified": int(np.count_nonzero(wanted)) - rejected,
         "rejected": rejected,
-        "outside_where": n - roles.ignored - wanted,
-        **({"ignored": roles.ignored} if roles.ignored else {}),
         "classes": {str(code): int(number[code]) for code in np.flatnonzero(number).tolist()},
     }

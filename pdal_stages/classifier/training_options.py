@@ -211,8 +211,8 @@ class TrainingOptions(Settings):
     lines: Sequence[int] = setting(
         (),
         "list",
-        "Classes whose points must lie on a line of such points, as wires do: others get the class "
-        "that is next likely",
+        "Classes whose points lie on straight lines, as those of wires do: all that may be of them "
+        "and lies on such a line is, and nothing else",
         may_be_empty=True,
         check=_each(checks.whole, 0, 255),
     )

@@ -192,7 +192,7 @@ def _warmup(options: argparse.Namespace) -> None:
     """Run the kernels of heights, training, classification and objects once."""
     import numpy as np
 
-    from ..classifier.straight_lines import lie_on_lines
+    from ..classifier.line_evidence import find_lines
     from ..classifier.training import train
     from ..classifier.training_clouds import TrainingCloud
     from ..classifier.training_options import TrainingOptions
@@ -225,7 +225,7 @@ def _warmup(options: argparse.Namespace) -> None:
     classes = np.where(xyz[:, 2] > 6.0, 6, 2)
     model = train(TrainingCloud(xyz, classes, dimensions), how, progress=False)
     model.predict(xyz, dimensions, threads=1)
-    lie_on_lines(xyz, xyz)
+    find_lines(xyz, np.ones(len(xyz), np.float32))
     crown_cells(np.ones((9, 9)), 0.5, 0.5, 2.0)
     planes(np.ones((9, 9)), np.ones((9, 9)), 0.5, 1.0)
     if options.all:

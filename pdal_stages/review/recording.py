@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,6 +202,8 @@ class Recording(Observer):
         if RELIABILITY.name not in columns:  # else the file has the classes of points around
             reaches = [each.halo_m() for each in after]
             used = used_distances(reaches, lambda m, n: after[m].sees_results_of(after[n]))
+        model_stage = cast(ApplyModel, after[0])  # finds lines among the points that it classifies
+        used[0] += model_stage.model.reach_of_lines_m
         for each, used_m in zip(ours[first:], used, strict=True):
             each.update_context(outside=_OUTSIDE, used_m=used_m)
         part, known = SomeRows(seen, near), {_OUTSIDE: outside}

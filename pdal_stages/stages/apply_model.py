@@ -28,19 +28,25 @@ from ..base.dimensions import (
     probability,
 )
 from ..base.errors import OptionError
-from ..base.json_types import StageJson
-from ..base.messages import Count
+from ..base.json_types import JsonObject, StageJson
+from ..base.messages import Count, Report
 from ..base.progress import Progress
 from ..base.units import doubt_vertical_unit, is_too_flat, median_slope
 from ..classifier.calibration import ReliabilityLimits, read_calibration
 from ..classifier.interface import ClassStep
 from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import find
-from ..classifier.prediction import PointRoles, Prediction, PredictionOptions
+from ..classifier.prediction import (
+    LineCandidates,
+    Locate,
+    PointRoles,
+    Prediction,
+    PredictionOptions,
+)
 from ..terrain.filter_options import FilterOptions
 from .base import Kept, Observer, Stage, StageContext
 from .options import Selection, ignore_option, keep_option, option
-from .points import LAS_DIMENSIONS, Points, class_counts
+from .points import LAS_DIMENSIONS, RESERVED, Points, class_counts
 from .preprocessing import as_json, same, with_given_ground
 
 _HEIGHT = HEIGHT.name
@@ -52,6 +58,16 @@ _TOLERANCE_M = FilterOptions.threshold
 _STEPS = 64
 #: The same for heights, steps per unit of z.
 _HEIGHT_STEPS = 32
+#: The part of the stage that gives every point its probabilities ...
+PROBABILITIES = "probabilities"
+#: ... and the one that finds lines among these.
+LINES = "lines"
+#: What the first part leaves for the second: of points that may be part of lines, else 0.
+_CANDIDATES = (
+    Dimension(f"{RESERVED}LineProbability", "float", "1", "probability of classes of lines"),
+    Dimension(f"{RESERVED}LineClass", "uint8_t", "1", "class on a line"),
+    Dimension(f"{RESERVED}OtherClass", "uint8_t", "1", "class on no line"),
+)
 
 
 class ApplyModel(Stage, settings=PredictionOptions):
@@ -63,7 +79,6 @@ class ApplyModel(Stage, settings=PredictionOptions):
     where_chooses = True
     where_help = "Points outside keep their class but still serve as neighbors"
     forgets = True
-    costly = True
     rejected = Count("rejected as unreliable")
     ignored = Count("noise and withheld points, not classified (ignore)")
     kept = Count("class kept (keep)")
@@ -119,9 +134,17 @@ class ApplyModel(Stage, settings=PredictionOptions):
         f"{_TOLERANCE_M} m of it (HeightAboveGround)",
     )
     memory_mb: float
+    part: str = option(
+        "string",
+        "",
+        "For tiles, which run the stage as two and set it themselves: first probabilities, then "
+        "lines, which are found among the probabilities of all points around",
+        choices=("", PROBABILITIES, LINES),
+    )
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
+        self.costly = self.part != LINES
         self.limits  # noqa: B018  refused here where nothing is known of the model
         if self.mark and not re.fullmatch(r"[A-Za-z]\w*", self.mark):
             raise OptionError("option 'mark' must be a name of letters and digits", found=self.mark)
@@ -131,6 +154,12 @@ class ApplyModel(Stage, settings=PredictionOptions):
         if self.mark.lower() in taken:
             raise self._mark_exists(self.mark)
         codes = [code for code, _ in self.model.classes]
+        if self.part and not self.model.lines.any():
+            raise OptionError(
+                "option 'part' is for models with classes of lines",
+                found=f"{self.model_file}, which has none",
+                cure="Leave it out",
+            )
         if self.variance and not self.model.gives_variance:
             raise OptionError(
                 "option 'variance' is for networks",
@@ -180,7 +209,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
     def check_upstream(self) -> str | None:
         """Return a warning about the stages upstream; None where they fit."""
-        trained = self.preparation
+        trained = [] if self.part == LINES else self.preparation
         fits = not trained or not self.upstream or same(self.upstream, trained)
         if fits or (self.given_ground and same(self.upstream, with_given_ground(trained))):
             return None
@@ -192,7 +221,10 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
-        names = [*self.model.required_dimensions]
+        if self.part == LINES:
+            names = [dimension.name for dimension in (*self._results, *_CANDIDATES)]
+        else:
+            names = [*self.model.required_dimensions]
         if self.vegetation_heights or self.given_ground:
             names.append(_HEIGHT)
         return list(dict.fromkeys(names))
@@ -205,7 +237,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
     def written_dimensions(self) -> Sequence[Dimension]:
         """Return the dimensions that are written."""
         mark = Dimension(self.mark, "uint8_t", "1", "1 for points inside `where`, else 0")
-        return [*self._results, *([mark] if self.mark else [])]
+        candidates = _CANDIDATES if self.part == PROBABILITIES else ()
+        return [*self._results, *([mark] if self.mark else []), *candidates]
 
     @property
     def _results(self) -> list[Dimension]:
@@ -220,7 +253,14 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
-        return self.model.halo_m
+        reaches = {PROBABILITIES: self.model.reach_m, LINES: self.model.reach_of_lines_m}
+        return reaches.get(self.part, self.model.halo_m)
+
+    def parts(self) -> Sequence[JsonObject]:
+        """Return how the options of the two stages differ that find probabilities, then lines."""
+        if self.part or not self.model.lines.any():
+            return ()
+        return {"part": PROBABILITIES}, {"part": LINES, "where": None, "mark": None}
 
     def written_classes(self) -> set[int]:
         """Return the class codes that may be written."""
@@ -242,6 +282,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Classify the points."""
+        if self.part == LINES:
+            return self._find_lines(points, context)
         same = [name for name in points.arrays if name.lower() == self.mark.lower()]
         if self.mark and (len(same) > 1 or any(points.arrays[name].any() for name in same)):
             raise self._mark_exists(", ".join(same))
@@ -255,6 +297,7 @@ class ApplyModel(Stage, settings=PredictionOptions):
         kept = kept | is_terrain
         points.tally(self.ignored, inside & ignored)
         points.tally(self.kept, inside & kept & ~ignored)
+        points.tally(self.outside_where, ~inside)
         wanted = inside & ~ignored & ~kept
         dimensions = {
             n: points.arrays[n] for n in self.model.optional_dimensions if n in points.arrays
@@ -272,33 +315,81 @@ class ApplyModel(Stage, settings=PredictionOptions):
             roles = PointRoles.check(points.count, wanted, ignored, current, ground)
             how = self._prediction(context.observer)
             prediction = self.model.classify(points.take_xyz(), dimensions, roles, how, progress)
-        rejected = np.zeros(points.count, np.bool_)
-        rejected[prediction.unsure] = True
-        codes = prediction.classification
-        if self.vegetation_heights:
-            by_height(codes, wanted & ~rejected, points.dimension(_HEIGHT), self.vegetation_heights)
-            if context.observer is not None:
-                context.observer.see_classes(ClassStep.HEIGHTS, codes)
-            prediction.report.figures["classes"] = class_counts(codes[wanted])
+        values: dict[str, NDArray] = {}
+        locate: Locate | None = points.coordinates
+        final = None
+        if self.part == PROBABILITIES and (candidates := prediction.candidates) is not None:
+            columns = candidates.probability, candidates.code, prediction.classification.copy()
+            values = dict(zip((each.name for each in _CANDIDATES), columns, strict=True))
+            prediction.classification[candidates.chosen] = current[candidates.chosen]
+            locate, final = None, ~candidates.chosen
+            wanted = wanted & final
+        prediction = self.model.finish(prediction, wanted, how, locate, current)
+        values |= self._settle(points, prediction, wanted, final, context.observer)
         if _HEIGHT in points.arrays:
+            codes = prediction.classification
             leaves = wanted & np.isin(codes, (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION))
             leaf_heights = points.dimension(_HEIGHT)[leaves]
             doubt = doubt_vertical_unit(
                 leaf_heights, slope, points.units.vertical, elevation, too_flat
             )
             points.report.warnings += [doubt] if doubt else []
-        values = self._columns(points, prediction)
         if self.mark:
             values[self.mark] = inside
+        return values
+
+    def _find_lines(self, points: Points, context: StageContext) -> dict[str, NDArray]:
+        """Decide between the classes of candidates, whose probabilities an earlier part gave."""
+        current = points.class_codes
+        share, code, other = (np.asarray(points.arrays[d.name]) for d in _CANDIDATES)
+        candidates = LineCandidates(share, code)
+        names = [name for name in (RELIABILITY.name, MARGIN.name) if name in self.creates()]
+        columns = {name.lower(): np.array(points.arrays[name]) for name in names}
+        if self.probabilities:
+            shares = [points.arrays[probability(each).name] for each in self.model.codes.tolist()]
+            columns["probabilities"] = np.column_stack(shares)
+        prediction = Prediction(
+            np.where(candidates.chosen, other, current),
+            report=Report({"points": points.count}),
+            candidates=candidates,
+            **columns,
+        )
+        how = self._prediction(context.observer)
+        wanted = candidates.chosen
+        prediction = self.model.finish(prediction, wanted, how, points.coordinates, current)
+        return self._settle(points, prediction, wanted, wanted, context.observer)
+
+    def _settle(
+        self,
+        points: Points,
+        prediction: Prediction,
+        wanted: NDArray[np.bool_],
+        final: NDArray[np.bool_] | None,
+        observer: Observer | None,
+    ) -> dict[str, NDArray]:
+        """Return the dimensions of a finished prediction, of which points (n,) are `final`."""
+        rejected = np.zeros(points.count, np.bool_)
+        rejected[prediction.unsure] = True
+        codes = prediction.classification
+        if self.vegetation_heights:
+            by_height(codes, wanted & ~rejected, points.dimension(_HEIGHT), self.vegetation_heights)
+            if observer is not None:
+                observer.see_classes(ClassStep.HEIGHTS, codes)
+            prediction.report.figures["classes"] = class_counts(codes[wanted])
+        values = self._columns(points, prediction, final)
         values["Classification"] = points.with_codes(codes)
         if self.reject_below is not None or self.limits is not None:
             points.tally(self.rejected, rejected)
         points.report.merge(prediction.report)
-        points.tally(self.outside_where, ~inside)
         return values
 
-    def _columns(self, points: Points, prediction: Prediction) -> dict[str, NDArray]:
-        """Return all dimensions but the class; points outside `where` keep what they had."""
+    def _columns(
+        self, points: Points, prediction: Prediction, final: NDArray[np.bool_] | None
+    ) -> dict[str, NDArray]:
+        """Return all dimensions but the class; points outside `where` keep what they had.
+
+        What a later part needs is not rounded: points (n,) that are not `final`.
+        """
         values: dict[str, NDArray] = {"Reliability": prediction.reliability}
         more = {"Margin": prediction.margin, "Variance": prediction.variance}
         values |= {name: column for name, column in more.items() if column is not None}
@@ -306,9 +397,13 @@ class ApplyModel(Stage, settings=PredictionOptions):
             columns = zip(self.model.codes, prediction.probabilities.T, strict=True)
             values |= {f"Probability_{code}": column for code, column in columns}
         if self.compact:
-            values = {name: _round(column, _STEPS) for name, column in values.items()}
+            steps = dict.fromkeys(values, _STEPS)
             if _HEIGHT in points.arrays:
-                values[_HEIGHT] = _round(points.arrays[_HEIGHT], _HEIGHT_STEPS)
+                values[_HEIGHT] = points.arrays[_HEIGHT]
+                steps[_HEIGHT] = _HEIGHT_STEPS
+            for name, column in values.items():
+                rounded = np.round(column * steps[name]) / steps[name]
+                values[name] = rounded if final is None else np.where(final, rounded, column)
         if points.mask is not None:
             for name, column in values.items():
                 values[name] = np.where(points.mask, column, points.arrays[name])
@@ -319,8 +414,3 @@ class ApplyModel(Stage, settings=PredictionOptions):
         if "Ground" in points.arrays:
             return np.asarray(points.arrays["Ground"]) > 0
         return np.abs(points.dimension(_HEIGHT)) <= _TOLERANCE_M
-
-
-def _round(values: NDArray, steps: int) -> NDArray:
-    """Round values (n,) to multiples of 1 / `steps`."""
-    return np.round(values * steps) / steps

@@ -166,7 +166,7 @@ class Stage(ABC):
     forgets: ClassVar[bool] = False
     #: Whether its results cost much: later stages of tiles that look around read them from a round
     #: before, and do not have them computed again in surroundings.
-    costly: ClassVar[bool] = False
+    costly: bool = False
     #: Whether points beyond the halo may matter; tiles then call :meth:`reach_of` and read farther.
     open_ended: ClassVar[bool] = False
 
@@ -289,6 +289,14 @@ class Stage(ABC):
     def halo_m(self) -> float:
         """Return how far around a tile points change its results, in meters."""
         return 0.0
+
+    def parts(self) -> Sequence[JsonObject]:
+        """Return the options, beside its own, of the stages that do the same one after the other.
+
+        An option that they do not get is None. Where there are such stages, tiles run them instead,
+        and the later ones read the results of the earlier ones around a tile from a round before.
+        """
+        return ()
 
     def blocks(self) -> Blocks | None:
         """Return the blocks that a :class:`FarReaching` stage needs before the tiles, if any."""

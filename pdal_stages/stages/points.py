@@ -77,6 +77,7 @@ class Points:
 
     def __post_init__(self) -> None:
         """Evaluate `where`."""
+        self._source = self.arrays
         self.count = len(self.arrays["X"]) if "X" in self.arrays else 0
         self.report = Report({"points": self.count})
         self.mask = self.used
@@ -136,15 +137,7 @@ class Points:
         StageError
             If any is NaN or infinite, with the count.
         """
-        axes = []
-        for name in "XYZ":
-            with np.errstate(over="ignore"):  # such coordinates are refused below
-                values = np.asarray(self.dimension(name, meters=False)) * _STEPS_PER_UNIT
-            np.rint(values, out=values)
-            values /= _STEPS_PER_UNIT
-            unit = self.units.vertical if name == "Z" else self.units.horizontal
-            axes.append(values if unit == 1.0 else values * unit)
-        x, y, z = axes
+        x, y, z = axes = [self._in_meters(name, self._array(name)) for name in "XYZ"]
         if not all(np.isfinite(values).all() for values in axes):
             bad = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))
             raise StageError(
@@ -155,6 +148,23 @@ class Points:
                 'in a pipeline: {"type": "filters.range", "limits": "X[:1e9],Y[:1e9],Z[-1e5:1e5]"}',
             )
         return x, y, z
+
+    def _in_meters(self, name: str, values: NDArray) -> NDArray[np.float64]:
+        """Return values (n,) of an axis in meters, rounded."""
+        with np.errstate(over="ignore"):  # such coordinates are refused
+            rounded = np.asarray(values) * _STEPS_PER_UNIT
+        np.rint(rounded, out=rounded)
+        rounded /= _STEPS_PER_UNIT
+        unit = self.units.vertical if name == "Z" else self.units.horizontal
+        return rounded if unit == 1.0 else rounded * unit
+
+    def coordinates(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the coordinates (m, 3) of some points in meters, also once others are forgotten.
+
+        They are read anew, so that nobody holds those of all points meanwhile.
+        """
+        axes = [self._in_meters(name, np.asarray(self._source[name])[rows]) for name in "XYZ"]
+        return np.column_stack(axes)
 
     def keep_only(self, names: Iterable[str]) -> None:
         """Forget the other dimensions, which nobody reads any more; keep `xyz`."""

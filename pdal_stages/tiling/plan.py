@@ -119,10 +119,11 @@ def make_plan(pipeline: Pipeline, buffer: float | None = None) -> TilePlan:
     end = max((n for n, stage in enumerate(filters, 1) if stage.sees_neighbors), default=0)
     for number, stage in enumerate(filters):
         check_in_tiles(stage, number < end, buffer)
-    in_tiles, per_output = filters[:end], [*filters[end:], *writers]
+    whole, per_output = filters[:end], [*filters[end:], *writers]
+    in_tiles = [part for stage in whole for part in stage.parts()]
     reaches = [stage.reach(buffer) for stage in in_tiles]
-    sees_m = make_round(in_tiles, reaches, 0, end).halo_m
-    ours_in_tiles = [stage.ours for stage in in_tiles if stage.ours is not None]
+    sees_m = make_round(in_tiles, reaches, 0, len(in_tiles)).halo_m
+    ours_in_tiles = [stage.ours for stage in whole if stage.ours is not None]
     makes = {name: kind for stage in ours_in_tiles for name, kind in stage.creates().items()}
     foreign = any(stage.ours is None and stage.type != "filters.merge" for stage in in_tiles)
     return TilePlan(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..base.errors import PipelineError
 from ..base.json_types import StageJson
@@ -11,6 +11,7 @@ from ..pipeline.expansion import stage_files
 from ..pipeline.inputs_outputs import named_files
 from ..pipeline.spatial_reference import MOVING
 from ..stages.base import Stage
+from ..stages.registry import stage_from
 
 # A filter of PDAL that neither list has, such as one that a later version adds, is taken to look
 # at neighbors: it needs --buffer.
@@ -60,6 +61,18 @@ class PlannedStage:
         read = [] if self.ours is None else stage_files(self.ours)
         paths = map(os.path.abspath, (*named_files([self.options]), *read))
         return [path for path in dict.fromkeys(paths) if os.path.exists(path)]
+
+    def parts(self) -> list[PlannedStage]:
+        """Return the stages that do its work in rounds one after the other; itself if it is one."""
+        if self.ours is None:
+            return [self]
+        out = []
+        for changes in self.ours.parts() or ({},):
+            changed = {**self.options, **changes}
+            options = {name: value for name, value in changed.items() if value is not None}
+            stage = stage_from(options).after(self.ours.upstream) if changes else self.ours
+            out.append(replace(self, options=options, ours=stage))
+        return out
 
     def sees_results_of(self, earlier: PlannedStage) -> bool:
         """Return whether an earlier step's results at neighbors can change a point's."""

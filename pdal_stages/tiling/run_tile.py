@@ -42,7 +42,7 @@ from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..pipeline.spatial_reference import NO_REFERENCE
 from ..stages.base import WHOLE_CLOUD
-from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, SELECTED, class_counts
+from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, RESERVED, SELECTED, class_counts
 from ..stages.registry import stage_types
 from .earlier_rounds import (
     ChangedValues,
@@ -234,10 +234,11 @@ class _RoundRun:
         """Take the results of the tile's own points, and reduce these for blocks."""
         part = self.context.plan.rounds[self.number]
         wanted = self.context.plan.creates if self._is_last else part.saved
-        names = [name for name in (ins if wanted is None else wanted) if name in ins]
+        if wanted is None:
+            wanted = [name for name in ins if not name.startswith(RESERVED)]
         rows = np.flatnonzero(ins[OUTSIDE] < 0)
-        origins = [ROW, INPUT, *(name for name in names if name not in _ORIGIN)]
-        self.views.append({name: ins[name][rows] for name in origins})
+        names = [ROW, INPUT, *(name for name in wanted if name in ins)]
+        self.views.append({name: ins[name][rows] for name in names})
         if part.blocks is not None and len(rows):
             stage = far_reaching(self.context)
             points = points_of(stage, WHOLE_CLOUD, module, SomeRows(ins, rows))
