@@ -16,8 +16,9 @@ from pdal_stages.classifier.training_percentiles import PERCENTILES
 from pdal_stages.cli import main
 from pdal_stages.review.explanation import AskedPlace
 from pdal_stages.review.places import read_places
-from pdal_stages.review.recording import Surroundings
+from pdal_stages.review.points_around import read_around
 from pdal_stages.review.trace_points import SURROUNDINGS, share_below
+from pdal_stages.terrain.heights import filtered_ground
 
 pytestmark = pytest.mark.pdal
 DATA = "tests/data/city.laz"
@@ -297,15 +298,37 @@ def test_errors(city, run, words, text):
     assert code == 1 and text in err and not out
 
 
-def test_where_points_are_too_many_fewer_are_read_and_that_is_said(city, explain, monkeypatch):
+def test_of_too_many_points_those_far_away_count_as_the_lowest_alone(city, explain, monkeypatch):
     from pdal_stages.review import explain as module
 
     _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 2)[:1])
-    text, _ = explain(city, *places[0])
-    assert "are not read" not in text
+    text, (whole,) = explain(city, *places[0])
+    assert "too many points" not in text
     monkeypatch.setattr(module, "_MOST_POINTS", 10_000)
     text, (each,) = explain(city, *places[0])
-    assert "m are not read" in text and each["computed"] == 2
+    assert "m only the lowest of each place count" in text and each["computed"] == 2
+    assert each["ground"]["height"] == pytest.approx(whole["ground"]["height"], abs=0.1)
+    text, _ = explain(city, *places[0], "--ground", "given")
+    assert "m are not read" in text
+
+
+@pytest.mark.parametrize("place", [(1210.0, 20.0), (1500.0, 10.0), (1790.0, 5.0)])
+def test_ground_is_that_of_the_whole_cloud_though_far_points_are_reduced(
+    place, explain, tmp_path, write_las
+):
+    """Hills, and halls wider than the windows, in a strip longer than the filter looks."""
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(0, 1, (2, 90_000)) * [[2400.0], [40.0]]
+    halls = np.isin(x // 60, (9, 10, 25, 26, 36))
+    z = 6 * np.sin(x / 90) + 0.02 * y + 5.0 * halls + rng.normal(0, 0.03, len(x))
+    xyz = np.round(np.stack([x, y, z]), 3)
+    write_las(tmp_path / "strip.las", dict(zip("XYZ", xyz, strict=True)))
+    whole = filtered_ground(*xyz, openings=[5, 17])
+    _, (each,) = explain(tmp_path / "strip.las", *place, "--no-noise")
+    row, steps = each["point"]["number"], each["ground"]
+    assert steps["height"] == whole["HeightAboveGround"][row]
+    assert steps["is_ground"] == whole["Ground"][row]
+    assert steps["openings"]["17.0"] == whole["HeightAboveOpening_17"][row]
 
 
 def test_what_it_cannot_run_is_refused(city, run, tmp_path):
@@ -380,7 +403,7 @@ def test_every_dimension_of_the_surroundings_can_be_read(city, tmp_path):
     files = [str(tmp_path / f"{name}.laz") for name in ("one", "two")]
     whole = columns_of_files(files)
     box = [770_600, 6_277_500, 770_660, 6_277_520]
-    around = Surroundings(files, box)
+    around = read_around(files, box, box, box, ("X", "Y"), pytest.fail)
     x, y = whole["X"], whole["Y"]
     inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
     assert 0 < inside.sum() < len(x) and {*around} == {*whole}
@@ -422,9 +445,9 @@ def test_a_file_whose_header_names_another_box_is_read(city, tmp_path):
     high, low = struct.unpack_from("<2d", data, 179)
     files = [str(tmp_path / "west.las"), str(tmp_path / "east.las")]
     box = [las.x.min(), las.y.min(), las.x.max(), las.y.max()]
-    right = Surroundings(files, box)
+    right = read_around(files, box, box, box, ["X"], pytest.fail)
     struct.pack_into("<2d", data, 179, high + 1e5, low + 1e5)
     (tmp_path / "east.las").write_bytes(data)
-    wrong = Surroundings(files, box)
+    wrong = read_around(files, box, box, box, ["X"], pytest.fail)
     assert len(right.number) == len(wrong.number) == len(las)
     assert all(np.array_equal(right[axis], wrong[axis]) for axis in "XYZ")

@@ -11,7 +11,7 @@ southernmost.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -172,6 +172,12 @@ class GridWindow(NamedTuple):
         right = min(self.left + self.width, other.left + other.width)
         top = min(self.bottom + self.height, other.bottom + other.height)
         return GridWindow(left, bottom, max(right - left, 0), max(top - bottom, 0))
+
+    def pieces(self, side: int) -> Iterator[GridWindow]:
+        """Yield windows of at most `side` columns and rows that it consists of."""
+        for bottom in range(self.bottom, self.bottom + self.height, side):
+            for left in range(self.left, self.left + self.width, side):
+                yield GridWindow(left, bottom, side, side).intersect(self)
 
     def slices_in(self, other: GridWindow) -> tuple[slice, slice]:
         """Return the rows and columns of this window in a raster of another one, which holds it."""

@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 import math
+from collections import ChainMap
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.dimensions import RELIABILITY
 from ..base.errors import OptionError
 from ..base.las import LasHeader, header_there
+from ..base.las_points import USUAL, LasColumns, layout_there
 from ..pipeline.classify_request import ClassifyRequest
+from ..pipeline.copies import selection
 from ..pipeline.inputs_outputs import input_files, is_las
 from ..pipeline.run import Pipeline
-from ..pipeline.spatial_reference import check_one_reference, reference_of_file
+from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of_file
 from ..stages.apply_model import ApplyModel
 from .explanation import AskedPlace, Explanation
-from .recording import Recording, Surroundings
+from .points_around import box_around, read_around
+from .recording import Reaches, Recording, ground_candidates
 from .trace_points import trace_point
 
 #: Files with fewer points together are read once, for all places (not tuned).
 _FEW_POINTS = 5_000_000
 #: Points that are read for one run at most, about: they take 0.4 GB a million.
 _MOST_POINTS = 10_000_000
-#: How the note on points that are left out begins.
-_TOO_MANY = "there are too many points: wide roofs may count otherwise, as those farther away than"
+#: Dimensions of all points that are read.
+_READ = (*USUAL, "ClassFlags")
+#: How the note on points that count less begins.
+_TOO_MANY = "there are too many points, so the ground may be another: of those farther away than"
 #: Side in meters of squares of larger ones whose places are explained in one run (not tuned).
 _SQUARE_M = 256.0
 
@@ -64,29 +73,74 @@ def explain_points(
         raise OptionError("explain reads LAS and LAZ files", found=odd[0], cure=cure)
     references = {path: reference_of_file(path) for path in files}
     check_one_reference(references)
-    reference = references[files[0]]
     exact = {**request.classifier_options, "compact": False}
     request = replace(request, dimensions=("Probability_",), classifier_options=exact)
-    unit = reference.units.horizontal
-    headers = [header for path in files if (header := header_there(path)) and header.count]
-    is_small = sum(header.count for header in headers) < _FEW_POINTS
+    cloud = _Cloud(files, references[files[0]], request, reach_m, against)
     out: dict[int, Explanation] = {}
-    for members in _squares(places, math.inf if is_small else _SQUARE_M / unit):
-        pipeline = _checked_pipeline(request, files[0], against)
-        far = min(reach_m, sum(ours.stage.halo_m() for ours in pipeline.expanded.ours)) / unit
-        xy = np.array([places[number][:2] for number in members])
-        reach = _reach_that_fits(headers, xy, far)
-        box = [*(xy.min(axis=0) - reach), *(xy.max(axis=0) + reach)]
-        cloud = Surroundings(files, box)
-        nearest = [cloud.nearest(places[number], unit) for number in members]
-        rows = np.array([row for row, _ in nearest])
-        recording = Recording(cloud, reference, request.where, rows)
-        recording.run(pipeline)
-        if reach < far:
-            recording.notes.append(f"{_TOO_MANY} {reach * unit:.0f} m are not read")
+    for members in cloud.squares(places):
+        recording, away = cloud.record([places[number] for number in members])
         for at, number in enumerate(members):
-            out[number] = trace_point(recording, at, nearest[at][1], against)
+            out[number] = trace_point(recording, at, away[at], against)
     return [out[number] for number in range(len(places))]
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    """The files in which points are explained, and how they are classified."""
+
+    files: Sequence[str]
+    reference: Reference
+    request: ClassifyRequest
+    reach_m: float
+    against: int | None
+
+    @cached_property
+    def headers(self) -> list[LasHeader]:
+        """Return the headers of files that have points."""
+        return [header for path in self.files if (header := header_there(path)) and header.count]
+
+    def squares(self, places: Sequence[AskedPlace]) -> list[list[int]]:
+        """Return the numbers of the places that are explained in one run, of each run."""
+        is_small = sum(header.count for header in self.headers) < _FEW_POINTS
+        side = math.inf if is_small else _SQUARE_M / self.reference.units.horizontal
+        squares: dict[tuple[float, float], list[int]] = {}
+        for number, place in enumerate(places):
+            squares.setdefault((place.x // side, place.y // side), []).append(number)
+        return list(squares.values())
+
+    def record(self, places: Sequence[AskedPlace]) -> tuple[Recording, list[float]]:
+        """Return what the stages make of the points nearest to places, and how far these are."""
+        unit, where = self.reference.units.horizontal, self.request.where
+        pipeline = _checked_pipeline(self.request, self.files[0], self.against)
+        stages = [each.stage for each in pipeline.expanded.ours]
+        layouts = filter(None, map(layout_there, self.files))
+        is_classified = any(RELIABILITY.name in layout.fields for layout in layouts)
+        needed = Reaches.of_stages(stages, is_classified)
+        xy = np.array([place[:2] for place in places])
+        fitting = unit * _reach_that_fits(self.headers, xy, needed.around / unit)
+        reaches = needed.limited(min(fitting, self.reach_m), self.reach_m)
+        far: list[NDArray[np.float64]] = [np.empty((0, 3))]
+
+        def reduce(columns: LasColumns) -> None:
+            if reaches.ground is not None:
+                seen = ChainMap(selection(where, columns), cast(dict, columns))
+                candidates = ground_candidates(reaches.ground, seen, self.reference.wkt)
+                far.append(reaches.ground.reduce_far(candidates))
+
+        near, outer, inner = (
+            box_around(xy, reach_m / unit)
+            for reach_m in (reaches.around, reaches.far, reaches.inner)
+        )
+        names = None if where else _READ
+        cloud = read_around(self.files, near, outer, inner, names, reduce)
+        nearest = [cloud.nearest(place, unit) for place in places]
+        rows = np.array([row for row, _ in nearest])
+        recording = Recording(cloud, self.reference, where, rows)
+        recording.run(pipeline, reaches, far)
+        if fitting < needed.around:
+            lost = "only the lowest of each place count" if reaches.ground else "are not read"
+            recording.notes.append(f"{_TOO_MANY} {fitting:.0f} m {lost}")
+        return recording, [away for _, away in nearest]
 
 
 def _checked_pipeline(request: ClassifyRequest, path: str, against: int | None) -> Pipeline:
@@ -117,11 +171,3 @@ def _reach_that_fits(headers: Sequence[LasHeader], xy: NDArray[np.float64], reac
         if points <= _MOST_POINTS:
             return reach
         reach *= 0.9
-
-
-def _squares(places: Sequence[AskedPlace], side: float) -> list[list[int]]:
-    """Return the numbers of the places in each square."""
-    squares: dict[tuple[float, float], list[int]] = {}
-    for number, place in enumerate(places):
-        squares.setdefault((place.x // side, place.y // side), []).append(number)
-    return list(squares.values())

@@ -1,144 +1,94 @@
-"""Points around a place, and what the stages of `classify` make of some of them, kept step by step.
+"""What the stages of `classify` make of some points of a cloud, kept step by step.
 
-All points within the reach of the stages are read, so results are those of a whole survey. The
-model computes the points in question, and what these depend on.
+The points around them are read as far as the stages look, so results are those of a whole survey.
+The model computes the points in question, and what these depend on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import cast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..base.columns import LazyColumns, SomeRows
-from ..base.dimensions import RELIABILITY
-from ..base.errors import NoTerrainError, StageError
+from ..base.columns import SomeRows
+from ..base.errors import NoTerrainError
 from ..base.grid import GridWindow
-from ..base.las_check import beyond_box
-from ..base.las_points import USUAL, LasColumns, Layout, read_records
 from ..classifier.interface import ClassStep, PassInputs
 from ..classifier.model import OTHER_DENSITY
-from ..features.cell_means import density
 from ..pipeline.copies import run_stages, selection
 from ..pipeline.run import Pipeline
-from ..pipeline.runtime import ExpandedStage
+from ..pipeline.runtime import ExpandedStage, points_of
 from ..pipeline.spatial_reference import Reference
 from ..stages.apply_model import ApplyModel
-from ..stages.base import Kept, Observer, Stage, used_distances
+from ..stages.base import WHOLE_CLOUD, Kept, Observer, Stage, used_distances
+from ..stages.hag_morphological import HagMorphological
 from ..stages.points import RESERVED
-from .explanation import AskedPlace
+from .points_around import Box, FilePoints, box_around, inside_box
 
 #: The dimension by which stages know the points that are explained: negative.
 _OUTSIDE = f"{RESERVED}Outside"
-#: Dimensions that are read where a file has them.
-_READ = (*USUAL, "ClassFlags", "HeightAboveGround", "Reliability", "Checked")
 #: Meters beyond the reach of the model and what follows, for neighbors of sparse points.
 _MARGIN_M = 32.0
-#: Farthest that the nearest point may be, in meters, ...
-_FARTHEST_M = 2.0
-#: ... or in mean distances between points, where these are larger.
-_FARTHEST_SPACINGS = 3.0
-#: Points of a file that are compared with the box in its header.
-_PROBED = 1000
+#: Dimensions of results, which are compared or that later runs begin with.
+_OF_RESULTS = ("HeightAboveGround", "Reliability", "Checked")
 
 
-def _is_in_its_box(path: str, layout: Layout) -> bool:
-    """Return whether the first points of a file lie in the box that its header names.
+@dataclass(frozen=True)
+class Reaches:
+    """How far around the points that are explained others matter, in meters.
 
-    Not all are read for that: a file whose box is wrong has mostly no point in it.
-    """
-    for records in read_records(path, layout, 0, min(_PROBED, layout.header.count), only=["X"]):
-        x, y = (layout.fields[axis].read(records) for axis in "XY")
-        return beyond_box(path, (x.min(), y.min(), x.max(), y.max())) is None
-    return True
-
-
-class Surroundings(LazyColumns):
-    """The dimensions of the points of files within a box, each read when it is asked for.
-
-    Those that every run needs are read in the first pass; another one takes a pass of its own.
+    The first stages, such as noise, run on all points around. The ground filter, where it is not
+    given its ground, takes of points far away the lowest of coarse cells. It classifies cells, and
+    then it, the model and what follows run on points near alone.
     """
 
-    def __init__(self, files: Sequence[str], box: Sequence[float]) -> None:
-        west, south, east, north = box
-        self.files = files
-        self._rows: dict[int, NDArray[np.int64]] = {}  #: of files that have points in the box
-        self._layouts = {n: Layout.of_file(path) for n, path in enumerate(files)}
-        for index, layout in list(self._layouts.items()):
-            x0, y0, x1, y1 = layout.header.box
-            apart = x0 > east or x1 < west or y0 > north or y1 < south
-            if apart and _is_in_its_box(files[index], layout):
-                del self._layouts[index]
-        first = []
-        for index, layout in self._layouts.items():
-            names, rows, at = [n for n in layout.fields if n in _READ], [np.zeros(0, np.int64)], 0
-            for records in read_records(files[index], layout, only=names):
-                x, y = (layout.fields[axis].read(records) for axis in "XY")
-                inside = (x >= west) & (x <= east) & (y >= south) & (y <= north)
-                rows.append(at + np.flatnonzero(inside))
-                first.append((layout, records if inside.all() else records[inside]))
-                at += len(records)
-            self._rows[index] = np.concatenate(rows)
-        self._first = LasColumns(first)
-        self._more: dict[str, NDArray] = {}
-        counts = [len(rows) for rows in self._rows.values()]
-        #: (n,) each: number of the file, and of the point in it
-        self.file = np.repeat(np.fromiter(self._rows, np.int64), counts)
-        self.number = np.concatenate([np.zeros(0, np.int64), *self._rows.values()])
+    first: int  #: number of the first stage that runs on points near alone
+    ground: HagMorphological | None  #: this stage, where it finds the ground in cells
+    used: Sequence[float]  #: of each stage: how far its results are used
+    near: float  #: what the stages from the first one on look at
+    inner: float  #: within which results of the stages before it count
+    around: float  #: what these look at
+    far: float  #: what the ground filter looks at
 
-    @property
-    def names(self) -> Collection[str]:
-        """Return the names of the dimensions."""
-        return self._first.names
+    @classmethod
+    def of_stages(cls, stages: Sequence[Stage], is_classified: bool) -> Reaches:
+        """Return the reaches of stages.
 
-    def __getitem__(self, name: str) -> NDArray:
-        """Return a dimension (n,)."""
-        if name in _READ or name not in self:
-            return self._first[name]
-        if name not in self._more:
-            parts: list[tuple[Layout, NDArray]] = []
-            for index, layout in self._layouts.items():
-                at, rows = 0, self._rows[index]
-                for records in read_records(self.files[index], layout, only=[name]):
-                    low, high = np.searchsorted(rows, (at, at + len(records)))
-                    parts.append((layout, records[rows[low:high] - at]))
-                    at += len(records)
-            self._more[name] = LasColumns(parts)[name]
-        return self._more[name]
-
-    def nearest(self, place: AskedPlace, unit: float) -> tuple[int, float]:
-        """Return the row of the nearest point and its distance in meters; StageError if far.
-
-        `unit` are the meters of a unit of the coordinates.
+        Those after the model read the classes of points around from a file that `classify` wrote
+        (`is_classified`); for another one they are computed.
         """
-        reason, target = "no point at all", np.array([v for v in place[:3] if v is not None])
-        if len(self.number):
-            xyz = np.column_stack([self[axis] for axis in "XYZ"])
-            away = unit * np.sqrt(((xyz[:, : len(target)] - target) ** 2).sum(axis=1))
-            inside = np.flatnonzero(away <= place.doubtful_m)
-            if len(inside) and "Reliability" in self:
-                row = int(inside[np.argmin(self["Reliability"][inside])])
-                return row, float(away[row])
-            row, near = int(np.argmin(away)), away < 50.0
-            spacing = 1.0 / np.sqrt(density(xyz[near] * unit)) if near.any() else 0.0
-            if away[row] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing, place.doubtful_m):
-                return row, float(away[row])
-            reason = f"the nearest is {away[row]:.1f} m away"
-            flat = unit * np.hypot(*(xyz[:, :2] - target[:2]).T)
-            if len(target) == 3 and flat.min() <= _FARTHEST_M:
-                reason += (
-                    f"; without Z {flat.min():.1f} m, at a height of {xyz[flat.argmin(), 2]:.2f}"
-                )
-        raise StageError(
-            "there is no point near this place",
-            where=" ".join(f"{value:.12g}" for value in target),
-            found=reason,
-            cure="Give X and Y in the cloud's reference system, or name theirs with --crs",
-        )
+        reaches = [stage.halo_m() for stage in stages]
+        first = model = next(n for n, stage in enumerate(stages) if isinstance(stage, ApplyModel))
+        blocks = ground = None
+        lines_m = sum(s.model.reach_of_lines_m for s in stages if isinstance(s, ApplyModel))
+        for number, stage in enumerate(stages[:model]):
+            if isinstance(stage, HagMorphological) and (blocks := stage.blocks()) is not None:
+                first, ground, reaches[number] = number, stage, 0.0
+
+        def sees(later: int, earlier: int) -> bool:
+            from_file = is_classified and earlier >= model
+            return not from_file and stages[later].sees_results_of(stages[earlier])
+
+        used = used_distances(reaches, sees)
+        later = zip(used[first:], reaches[first:], strict=True)
+        near = max(used_m + reach for used_m, reach in later) + _MARGIN_M
+        inner = far = near
+        if ground is not None and blocks is not None:
+            inner += ground.reach_near_m
+            far += blocks.margin + blocks.reach
+        around = inner + sum(reaches[:first])
+        used[model] += lines_m  # lines are found among the points that the model classifies
+        return cls(first, ground, used, near, inner, around, max(far, around))
+
+    def limited(self, around: float, far: float) -> Reaches:
+        """Return these where points farther away count as far, or, the other limit, not at all."""
+        around, far = min(self.around, around), min(self.far, far)
+        inner = min(around, max(self.near, around - (self.around - self.inner)))
+        far = far if self.ground is not None else around
+        return replace(self, inner=inner, around=around, far=max(around, far))
 
 
 #: What each step of the ground filter made of a piece of the cloud, by its name.
@@ -149,10 +99,10 @@ PieceRasters = dict[str, tuple[GridWindow, NDArray[np.float32]]]
 class Recording(Observer):
     """Results of stages for the points that are explained, as the stages tell them."""
 
-    cloud: Surroundings
+    cloud: FilePoints  #: the points near
     reference: Reference
     where: str | None  #: condition of the points that are classified
-    rows: NDArray[np.int64]  #: (m,) of the points in the surroundings
+    rows: NDArray[np.int64]  #: (m,) of the points in question
     rows_seen: NDArray[np.int64] = field(init=False)  #: (m,) of the points where stages run
     stages: list[Stage] = field(default_factory=list)
     classes: list[NDArray[np.uint8]] = field(default_factory=list)  #: (m,) after each stage
@@ -170,47 +120,53 @@ class Recording(Observer):
     results: Mapping[str, NDArray] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
-    def run(self, pipeline: Pipeline) -> None:
-        """Run the stages; those from the model on on points near, and for the points alone.
+    def run(self, pipeline: Pipeline, reaches: Reaches, far: Sequence[NDArray[np.float64]]) -> None:
+        """Run the stages: the first ones on all points, those after them on points near.
 
-        Stages after the model read the classes of points around from a file that `classify` wrote;
-        for another one they are computed.
+        `far` are parts of the points that :meth:`.HagMorphological.reduce_far` left.
         """
-        ours, unit = pipeline.expanded.ours, self.reference.units.horizontal
+        unit, wkt = self.reference.units.horizontal, self.reference.wkt
+        ours = pipeline.expanded.ours
         for each in ours:
             each.update_context(observer=self)
-        first = next(n for n, each in enumerate(ours) if isinstance(each.stage, ApplyModel))
-        columns, wkt = self.cloud, self.reference.wkt
+        around, known = self.cloud, selection(self.where, self.cloud)
         self.rows_seen = self.rows
-        known = selection(self.where, columns)
         try:
-            seen = run_stages(ours[:first], columns, wkt, known, self._keep_classes)
+            seen = run_stages(ours[: reaches.first], around, wkt, known, self._keep_classes)
         except NoTerrainError as error:
             raise NoTerrainError(
                 f"around the place {error.what}",
-                found=f"{len(columns.number):,} points, all that are read",
+                found=f"{len(around.number):,} points, all that are read",
                 cure="Explain places nearer to ground, or leave --ground given out",
             ) from None
-        reach = (sum(each.stage.halo_m() for each in ours[first:]) + _MARGIN_M) / unit
-        near = _rows_near(columns, self.rows, reach)
-        self.rows_seen = np.searchsorted(near, self.rows)
-        xy = np.column_stack([columns[axis][near] for axis in "XY"])
-        outside = unit * cKDTree(xy[self.rows_seen]).query(xy, p=np.inf)[0]
-        outside[self.rows_seen] = -1.0
-        after = [each.stage for each in ours[first:]]
-        used = [0.0] * len(after)
-        if RELIABILITY.name not in columns:  # else the file has the classes of points around
-            reaches = [each.halo_m() for each in after]
-            used = used_distances(reaches, lambda m, n: after[m].sees_results_of(after[n]))
-        model_stage = cast(ApplyModel, after[0])  # finds lines among the points that it classifies
-        used[0] += model_stage.model.reach_of_lines_m
-        for each, used_m in zip(ours[first:], used, strict=True):
+        near = _rows_in(around, self._box(reaches.near / unit))
+        if (ground := reaches.ground) is not None:
+            candidates = ground_candidates(ground, seen, wkt)
+            x, y, _ = candidates
+            inner = inside_box(x, y, [unit * side for side in self._box(reaches.inner / unit)])
+            places = unit * np.column_stack([around[axis][self.rows] for axis in "XY"])
+            blocks = ground.cells_near(
+                candidates[:, inner], np.concatenate([*far]), places, reaches.near
+            )
+            ours[reaches.first].update_context(blocks=blocks)
+        self.cloud, self.rows = around.take(near), np.searchsorted(near, self.rows)
+        self.cloud.load(_OF_RESULTS)
+        self.rows_seen = self.rows
+        xy = np.column_stack([self.cloud[axis] for axis in "XY"])
+        outside = unit * cKDTree(xy[self.rows]).query(xy, p=np.inf)[0]
+        outside[self.rows] = -1.0
+        for each, used_m in zip(ours, reaches.used, strict=True):
             each.update_context(outside=_OUTSIDE, used_m=used_m)
-        part, known = SomeRows(seen, near), {_OUTSIDE: outside}
-        seen = run_stages(ours[first:], part, wkt, known, self._keep_classes)
-        self.results = SomeRows(seen, self.rows_seen)
+        known = {name: values[near] for name, values in seen.maps[0].items()}
+        known[_OUTSIDE] = outside
+        seen = run_stages(ours[reaches.first :], self.cloud, wkt, known, self._keep_classes)
+        self.results = SomeRows(seen, self.rows)
         texts = [*pipeline.expanded.warnings, *pipeline.messages]
         self.notes = [text for text in texts if OTHER_DENSITY not in text]
+
+    def _box(self, reach: float) -> Box:
+        """Return the box of the points in question, wider by a reach in units of coordinates."""
+        return box_around(np.column_stack([self.cloud[axis][self.rows] for axis in "XY"]), reach)
 
     def _keep_classes(self, each: ExpandedStage, seen: Mapping[str, NDArray]) -> None:
         self.stages.append(each.stage)
@@ -249,12 +205,14 @@ class Recording(Observer):
         self.steps[step] = codes[self.rows_seen], limit
 
 
-def _rows_near(
-    columns: Mapping[str, NDArray], rows: NDArray[np.int64], reach: float
-) -> NDArray[np.int64]:
-    """Return the rows of the points in the box around those of `rows`, `reach` wider."""
-    near = np.ones(len(columns["X"]), np.bool_)
-    for axis in (columns["X"], columns["Y"]):
-        at = axis[rows]
-        near &= (axis >= at.min() - reach) & (axis <= at.max() + reach)
-    return np.flatnonzero(near)
+def ground_candidates(
+    ground: HagMorphological, columns: Mapping[str, NDArray], wkt: str
+) -> NDArray[np.float64]:
+    """Return the coordinates (3, n), in meters, of the points that may be ground."""
+    module = {"spatialreference": {"wkt": wkt}}
+    return ground.ground_candidates(points_of(ground, WHOLE_CLOUD, module, columns))
+
+
+def _rows_in(columns: Mapping[str, NDArray], box: Box) -> NDArray[np.int64]:
+    """Return the rows of the points in a box."""
+    return np.flatnonzero(inside_box(columns["X"], columns["Y"], box))

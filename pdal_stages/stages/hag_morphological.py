@@ -15,16 +15,20 @@ from ..base.errors import NoTerrainError
 from ..base.files import check_writable
 from ..base.geotiff import rasterio, write_geotiff
 from ..base.grid import GridWindow
+from ..terrain.cells import HIGHEST
 from ..terrain.filter_options import FilterOptions, Keep
 from ..terrain.ground_blocks import (
     BLOCK_SIDE,
     GroundCells,
+    cells_near,
     cells_of_block,
+    reach_near_cells,
     reach_of_block,
     reduced_points,
 )
 from ..terrain.heights import filtered_ground, spread
 from ..terrain.smrf import reach_of_cells, reach_of_given, reach_of_points
+from ..terrain.wide_roofs import lowest_of_coarse_cells
 from .base import HEIGHTS_OUTSIDE, Blocks, FarReaching, StageContext, inside_block
 from .options import Selection, ignore_option, option
 from .points import Points
@@ -123,6 +127,30 @@ class HagMorphological(FarReaching, settings=FilterOptions):
     ) -> dict[str, NDArray]:
         """Compute the cells of a block, in squares."""
         return cells_of_block(far_points, block, self._filter, inside, bool(self.keep_rasters))
+
+    @property
+    def reach_near_m(self) -> float:
+        """Return how far around points :meth:`cells_near` needs others, not only far ones."""
+        return reach_near_cells(self._filter) * self.cell
+
+    def ground_candidates(self, points: Points) -> NDArray[np.float64]:
+        """Return the coordinates (3, n), in meters, of the points that may be ground."""
+        use = points.usable(self.ignore) & (np.abs(points.axes[2]) < HIGHEST)
+        return np.stack([axis[use] for axis in points.axes])
+
+    def reduce_far(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the points (m, 3) that stand for candidates (3, n) far away."""
+        return lowest_of_coarse_cells(candidates.T, self.cell)
+
+    def cells_near(
+        self,
+        candidates: NDArray[np.float64],
+        far: NDArray[np.float64],
+        places: NDArray[np.float64],
+        reach_m: float,
+    ) -> list[dict[str, NDArray]]:
+        """Compute blocks for heights near places (:func:`..terrain.ground_blocks.cells_near`)."""
+        return [*cells_near(candidates, far, places, reach_m, self._filter)]
 
     def _write_rasters(self, points: Points) -> Keep | None:
         """Return a function that writes rasters of steps to files, in the units of the points."""

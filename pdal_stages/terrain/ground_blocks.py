@@ -25,6 +25,7 @@ from .smrf import (
     cell_steps,
     ground_filter,
     holes,
+    reach_of_cells,
 )
 from .steps import Chain
 from .surface import GroundRaster, heights_above
@@ -139,13 +140,11 @@ def reduced_points(
     """
     rows = np.flatnonzero(use & (np.abs(z) < HIGHEST))
     xyz = np.column_stack([axis[rows] for axis in (x, y, z)])
-    x, y, z = xyz.T
-    column, row = cell_numbers(x, options.cell), cell_numbers(y, options.cell)
-    cells, number = np.unique(cell_keys(column, row), return_inverse=True)
-    low = lowest_points(x, y, z, number, len(cells))
+    column, row = (cell_numbers(axis, options.cell) for axis in xyz.T[:2])
+    low = _lowest_of_cells(xyz.T, column, row)
     column, row = column // BLOCK_SIDE, row // BLOCK_SIDE
     blocks = group_by_key(cell_keys(column, row))
-    return xyz[low], {(int(column[b[0]]), int(row[b[0]])): xyz[b] for b in blocks}
+    return low, {(int(column[b[0]]), int(row[b[0]])): xyz[b] for b in blocks}
 
 
 def cells_of_block(
@@ -171,6 +170,79 @@ def cells_of_block(
         Whether records hold what each step made.
     """
     core = GridWindow(block[0] * BLOCK_SIDE, block[1] * BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+    return cells_of_window(outer, core, options, points, keep)
+
+
+def cells_near(
+    points: NDArray[np.float64],
+    far: NDArray[np.float64],
+    places: NDArray[np.float64],
+    reach: float,
+    options: FilterOptions,
+) -> list[dict[str, NDArray[np.void]]]:
+    """Compute the cells that heights near places depend on, and what each step made of them.
+
+    Parameters
+    ----------
+    points : (3, n) float64
+        Points that may be ground, in meters: all within `reach` and :func:`reach_near_cells` of the
+        places, or more.
+    far : (m, 3) float64
+        The :func:`.wide_roofs.lowest_of_coarse_cells` of those farther away, up to
+        :func:`reach_of_block`.
+    places : (k, 2) float64
+        In meters.
+    reach : float
+        Meters around places within which heights are right.
+    options : FilterOptions
+
+    Returns
+    -------
+    list of dict
+        Blocks of a :class:`GroundCells`.
+    """
+    column, row = (cell_numbers(axis, options.cell) for axis in points[:2])
+    outer = np.concatenate([_lowest_of_cells(points, column, row), far])
+    at = cell_numbers(places, options.cell).T
+    reach_cells = int(np.ceil(reach / options.cell)) + reach_of_cells(options)
+    blocks = []
+    for core in GridWindow.enclosing(*at).padded(reach_cells).pieces(BLOCK_SIDE):
+        if core.padded(reach_cells).contains(*at).any():
+            inside = np.ascontiguousarray(points[:, core.contains(column, row)].T)
+            blocks.append(cells_of_window(outer, core, options, [inside], keep=True))
+    return blocks
+
+
+def reach_near_cells(options: FilterOptions) -> int:
+    """Return how far around points, in cells, more than the lowest of coarse cells matters."""
+    steps = _steps_of_block(options)
+    near = steps.reach(MINIMUM_GRID, steps.last) + 1
+    return reach_of_cells(options) + near + wide_roofs.RULES.cells_per_side(options.cell)
+
+
+def _lowest_of_cells(
+    points: NDArray[np.float64], column: NDArray[np.int64], row: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the lowest points (m, 3) of the cells of points (3, n)."""
+    window = GridWindow.enclosing(column, row)
+    count = window.width * window.height
+    if count <= len(column):
+        number = window.flat_index(column, row)
+    else:  # most cells are empty
+        cells, number = np.unique(cell_keys(column, row), return_inverse=True)
+        count = len(cells)
+    low = lowest_points(points[0], points[1], points[2], number, count)
+    return points[:, low[low >= 0]].T
+
+
+def cells_of_window(
+    outer: NDArray[np.float64],
+    core: GridWindow,
+    options: FilterOptions,
+    points: Iterable[NDArray[np.float64]] = (),
+    keep: bool = False,
+) -> dict[str, NDArray[np.void]]:
+    """Compute the cells of a window as :func:`cells_of_block` those of a block."""
     steps, classify = _steps_of_block(options), cell_steps(options)
     wanted = core.padded(1)  # points blend the four cells around them
     low = _in_cells(_thinned_far_away(outer, wanted, steps, options.cell), options)
