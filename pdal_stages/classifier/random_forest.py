@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.errors import ModelError
-from ..base.jit import njit
+from ..base.jit import device, njit
 from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from ..base.threads import map_blocks
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 #: Levels below the root a tree may have: a bound for files from strangers.
 MAX_DEPTH = 10_000
-#: Rows that walk a tree together: many nodes are loaded at a time.
-#: For speed alone, like GROUP: results do not depend on it.
-LANES = 8
 #: Rows that walk one tree before the next one's turn: their values stay in a core's cache.
-GROUP = 2048
+#: For speed alone, like SHARE: results do not depend on it.
+GROUP = 1024
+#: Nodes that more than one in so many rows of a group reach are compared with all rows at once.
+SHARE = 16
 #: A node as it is walked. A leaf is its own left child under a threshold that is not a number,
 #: which nothing exceeds.
 _NODE = np.dtype(
@@ -226,30 +226,92 @@ def add_along_paths(values, sizes, nodes, shares, added):
 
 @njit
 def walk(values, sizes, nodes, shares, out):
-    """Add the class frequencies of all trees to `out` (n, classes), for rows (n, features)."""
-    at = np.zeros(LANES, np.uint32)
-    for first in range(0, len(values), GROUP):
-        last = min(len(values), first + GROUP)
-        start = 0
+    """Add the class frequencies of all trees to `out` (n, classes), for rows (n, features).
+
+    Most rows of a tree go through few nodes. There all rows of a group are compared in vector
+    registers, wherever they are; from there on the rows walk by themselves, in rounds of a node
+    each, so that no row waits for another.
+    """
+    n, width = values.shape
+    columns = np.empty((width, min(n, GROUP)), np.float32)
+    at, active = np.empty(GROUP, np.uint32), np.empty(GROUP, np.uint16)
+    stack = np.empty((SHARE, 2), np.uint32)
+    for first in range(0, n, GROUP):
+        count = min(n - first, GROUP)
+        copy_columns(values, first, count, columns)
+        start = np.uint64(0)
         for t in range(len(sizes)):
-            tree = nodes[start : start + sizes[t]]
-            start += sizes[t]
-            for row in range(first, last, LANES):
-                at[:] = 0
-                moving = True
-                while moving:
-                    changed = np.uint32(0)
-                    for lane in range(LANES):
-                        node = tree[at[lane]]
-                        value = values[min(row + lane, last - 1), node.feature]
-                        to = np.uint32(node.left + np.uint32(value > node.threshold))
-                        changed |= to ^ at[lane]
-                        at[lane] = to
-                    moving = changed != 0
-                for lane in range(min(LANES, last - row)):
-                    leaf = tree[at[lane]].leaf
-                    for c in range(out.shape[1]):
-                        out[row + lane, c] += shares[leaf, c]
+            at[:count] = 0
+            walk_together(columns, nodes, start, at, stack, count)
+            walk_alone(columns, nodes, start, at, active, count)
+            for r in range(count):
+                leaf, row = nodes[start + at[r]].leaf, np.uint64(first + r)
+                for c in range(np.uint64(out.shape[1])):
+                    out[row, c] += shares[leaf, c]
+            start += np.uint64(sizes[t])
+
+
+@device
+def copy_columns(values, first, count, columns):
+    """Copy `count` rows of `values` from `first` on to `columns` (features, rows), by tiles."""
+    for low in range(0, count, 8):
+        for c in range(len(columns)):
+            for r in range(low, min(low + 8, count)):
+                columns[c, r] = values[first + r, c]
+
+
+@device
+def walk_together(columns, nodes, start, at, stack, count):
+    """Move rows through the nodes of a tree that more than one in SHARE of them reach.
+
+    `at` (rows,) are the nodes where rows are, 0 before. Nodes on the stack hold different rows, so
+    these are fewer than SHARE.
+    """
+    least = np.uint32(count // SHARE + 1)
+    stack[0, 0], stack[0, 1] = 0, count
+    top = 1
+    while top > 0:
+        top -= 1
+        place, rows = stack[top, 0], stack[top, 1]
+        node = nodes[start + place]
+        right = step(columns[node.feature], node.threshold, place, node.left, at, count)
+        for side in range(2):
+            child = np.uint32(node.left + side)
+            reached = right if side else np.uint32(rows - right)
+            if reached >= least and nodes[start + child].left != child:
+                stack[top, 0], stack[top, 1] = child, reached
+                top += 1
+
+
+@device
+def step(column, threshold, place, left, at, count):
+    """Move the rows that are at a node to its children; return how many went to the right one."""
+    right = np.uint32(0)
+    for r in range(count):
+        here = at[r] == place
+        exceeds = np.uint32(column[r] > threshold)
+        right += exceeds if here else np.uint32(0)
+        at[r] = left + exceeds if here else at[r]
+    return right
+
+
+@device
+def walk_alone(columns, nodes, start, at, active, count):
+    """Move rows from the nodes where they are to leaves; `active` is scratch."""
+    for r in range(count):
+        active[r] = r
+    remaining = np.uint64(count)
+    while remaining > 0:
+        moved = np.uint64(0)
+        for i in range(remaining):
+            r = active[i]
+            node = nodes[start + at[r]]
+            to = np.uint32(node.left + np.uint32(columns[node.feature, r] > node.threshold))
+            # Written always, kept if it moved: no branch to mispredict.
+            active[moved] = r
+            moved += np.uint64(to != at[r])
+            at[r] = to
+        remaining = moved
 
 
 def _laid_out(
