@@ -3,8 +3,9 @@
 A wire is long; what looks like one in a crown, at a roof's edge or in a sliver of a survey is not.
 So a low probability makes a point a *candidate*, and the line decides. A line is a tube from one
 candidate toward a likely one, a *guide*: candidates in the tube speak for it by their probability,
-those in a ring around the tube against it. A line is looked at where its guides count at least as
-much as those of all lines that the candidate tried before.
+those in a ring around the tube against it, the less the likelier the candidate itself is: a likely
+wire may hang beside others, an unlikely one is a twig beside a wire. A line is looked at where its
+guides count at least as much as those of all lines that the candidate tried before.
 
 There are two steps: guides must lie on lines themselves, and then every candidate looks toward the
 guides that do. Where no candidate is likely, next to nothing is computed.
@@ -55,7 +56,8 @@ class LineEvidenceRules(NamedTuple):
     radius: float = 32.0  #: candidates up to this far away, in plan, are looked at
     width: float = 0.4  #: radius of the tube: a wire sags, and its echoes scatter by 0.1 m
     ring: float = 1.2  #: outer radius of the ring around it
-    against: float = 0.75  #: what a candidate in the ring counts
+    #: what a candidate in the ring counts, times how unlikely the point on the line is
+    against: float = 1.5
     far: float = 5.0  #: guides farther away than this tell directions
     cube: float = 0.5  #: of each cube of this side the likeliest candidate counts
     looks: int = 1 << 17  #: guides looked at for a point at most: of many, lines to some are tried
@@ -149,7 +151,8 @@ def _look(
 
     def mark(first: int) -> None:
         block = slice(first, first + BLOCK)
-        _mark(xyz[points[block]], place[block], *every, RULES, out[block])
+        rows = points[block]
+        _mark(xyz[rows], probability[rows], place[block], *every, RULES, out[block])
 
     for _ in map_blocks(mark, range(0, len(points), BLOCK), threads):
         pass
@@ -176,12 +179,13 @@ def _pick(xyz, probability, order, begin, rows):
 
 
 @njit
-def _mark(points, place, parts, guides, rules, out):
+def _mark(points, probability, place, parts, guides, rules, out):
     """Mark the points (n, 3), in cells (n,), that lie on lines of the parts toward guides."""
     for k in range(len(points)):
         near, n = _near(points[k], place[k], guides, rules.radius)
         every, m = near, 0
         most = rules.guides
+        against = rules.against * (1.0 - probability[k])
         for toward in range(0, n, max(1, n * n // rules.looks)):
             away = np.sqrt(near[0, toward] ** 2 + near[1, toward] ** 2)
             if away < rules.far:
@@ -195,7 +199,7 @@ def _mark(points, place, parts, guides, rules, out):
                 every, m = _near(points[k], place[k], parts, rules.radius)
             if _evidence_in_tube(every, m, line, rules.width) < 0.99 * rules.evidence:
                 continue  # the whole tube is not enough: no need to look for gaps and at the ring
-            if _evidence_of_line(every, m, line, rules) >= rules.evidence:
+            if _evidence_of_line(every, m, line, against, rules) >= rules.evidence:
                 out[k] = True
                 break
 
@@ -229,7 +233,7 @@ def _evidence_in_tube(near, n, line, width):
 
 
 @device(_nrt=True)
-def _evidence_of_line(near, n, line, rules):
+def _evidence_of_line(near, n, line, against, rules):
     """Return what n parts count for a line through 0, along which gaps are small; 0 if short."""
     u, v, rise = line
     along, worth = np.empty(n), np.empty(n)
@@ -246,7 +250,7 @@ def _evidence_of_line(near, n, line, rules):
             inside += 1
         elif beside <= rules.ring**2:
             outside -= 1
-            along[outside], worth[outside] = place, -rules.against * near[3, k]
+            along[outside], worth[outside] = place, -against * near[3, k]
     low, high = _ends(np.sort(along[:inside]), rules.gap)
     if high - low < rules.length:
         return 0.0
