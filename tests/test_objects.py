@@ -54,6 +54,8 @@ def same(a, b):
                 np.testing.assert_array_equal(part, twin)
     np.testing.assert_array_equal(a.key, b.key)
     np.testing.assert_array_equal(a.owner, b.owner)
+    np.testing.assert_array_equal(a.wires.place, b.wires.place)
+    np.testing.assert_array_equal(a.span, b.span)
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +103,49 @@ def test_a_wire_in_any_direction_is_one_span(cell, degrees):
     spans = found_in(*scene((wire, codes), size=250.0), cell=cell).tables[Kind.SPAN]
     assert len(spans) == 1
     assert spans.columns["length"].min() > 70
+
+
+def conductors(seed, length=180.0, slope=0.0):
+    """Return conductors side by side and above each other, sagging, with gaps; the one of each."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for across, up in ((0.0, 20.0), (3.0, 20.0), (0.0, 23.5), (3.0, 23.5), (1.5, 28.0)):
+        x = np.sort(rng.uniform(0, length, int(2.5 * length)))
+        lost = rng.uniform(20, length - 30)
+        x = x[(x < lost) | (x > lost + 8.0)]
+        sag = 5.0 * (1 - (2 * x / length - 1) ** 2)
+        parts.append(np.column_stack([x, across + slope * x, up - sag]))
+    return np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(each) for each in parts])
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_each_conductor_is_a_span_over_gaps_in_any_order_and_in_blocks(seed, slope):
+    wires, number = conductors(seed, slope=slope)
+    xyz, codes = scene((wires, np.full(len(wires), 14, np.uint8)), size=200.0)
+    cells = Cells.from_points(*xyz.T, codes, 0.5)
+    got = find_objects(cells, progress=False)
+    table = got.tables[Kind.SPAN]
+    assert len(table) == len(set(table.ids.tolist())) == 5
+    ids = got.ids_at(*wires.T, np.full(len(wires), Kind.SPAN))
+    for each in range(5):
+        assert len(np.unique(ids[number == each])) == 1
+    assert set(ids.tolist()) == set(table.ids.tolist())
+    assert (table.columns["sag"] > 4.0).all() and (table.columns["sag"] < 5.5).all()
+    assert np.sort(table.columns["h_low"]) == pytest.approx([15, 15, 18.5, 18.5, 23], abs=0.4)
+    order = np.random.default_rng(seed).permutation(len(xyz))
+    halves = [Cells.from_points(*xyz[part].T, codes[part], 0.5) for part in np.split(order, [900])]
+    same(got, find_objects(Cells.join(halves), block=100, progress=False))
+
+
+def test_wires_that_cross_far_apart_in_height_are_two_spans_and_close_ones_one():
+    along = np.arange(0, 60, 0.5)
+    level = np.zeros(len(along))
+    one = np.column_stack([along, level + 30, level + 12])
+    for above, spans in ((18.0, 2), (13.0, 1)):
+        wires = np.concatenate([one, np.column_stack([level + 30, along, level + above])])
+        codes = np.full(len(wires), 14, np.uint8)
+        assert len(found_in(*scene((wires, codes), size=60.0)).tables[Kind.SPAN]) == spans
 
 
 def test_a_building_larger_than_any_block_and_its_margin():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import laspy
 import numpy as np
 import pytest
+from test_objects import conductors
 
 import pdal_stages as ps
 from pdal_stages.base.errors import StageError
@@ -117,6 +118,21 @@ def test_a_tile_without_ground_is_only_warned_of(tmp_path, write_las):
     run = ps.run_tiled(stages(source, tmp_path / "tiled.laz"), 100, workers=0, progress=False)
     assert not run.failures
     whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
+    np.testing.assert_array_equal(whole["ObjectID"], tiled["ObjectID"])
+
+
+def test_conductors_that_are_longer_than_surroundings_are_whole_in_tiles(tmp_path, write_las):
+    wires, _ = conductors(4, length=900.0, slope=0.3)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0.0, 900, 3), np.arange(0.0, 290, 3)))
+    xyz = np.concatenate([wires, np.column_stack([x, y, np.zeros(len(x))])])
+    codes = np.repeat([14, 2], [len(wires), len(x)]).astype(np.uint8)
+    points = {**dict(zip("XYZ", xyz.T, strict=True)), "Classification": codes}
+    source = write_las(tmp_path / "line.las", points)
+    Pipeline(stages(source, tmp_path / "whole.laz")).execute(arrays=False)
+    run = ps.run_tiled(stages(source, tmp_path / "tiled.laz"), 300, workers=0, progress=False)
+    assert not run.failures
+    whole, tiled = laspy.read(tmp_path / "whole.laz"), laspy.read(tmp_path / "tiled.laz")
+    assert len(np.unique(np.asarray(whole["ObjectID"])[codes == 14])) == 5
     np.testing.assert_array_equal(whole["ObjectID"], tiled["ObjectID"])
 
 

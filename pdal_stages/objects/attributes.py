@@ -42,8 +42,8 @@ EAVE = 25
 RIDGE = 98
 #: Width of the pieces of wires whose means form a span's line, meters.
 PIECE = 2.0
-#: Wires that spread no wider than this across their direction lie side by side, meters: a line of
-#: masts carries its conductors within a few meters.
+#: Wires that spread no wider than this across their direction are straight or lie side by side,
+#: meters.
 MAX_SPREAD = 4.0
 
 
@@ -131,7 +131,7 @@ def measure_tree(cells: ObjectCells, top_row: int, top_column: int, size: float)
 
 
 def measure_span(cells: ObjectCells, size: float) -> JsonObject:
-    """Return length, clearance, sag, path and verdict of the wires between two masts."""
+    """Return length, clearance, sag, path and verdict of a conductor."""
     path = wire_path(cells, size)
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))]
     length, clearance = float(along[-1]), cells.low - cells.ground

@@ -88,16 +88,76 @@ def kind_of_code(classes: Mapping[Kind, Sequence[int]]) -> NDArray[np.int8]:
     return table
 
 
+#: Values of records (n,): count, low, high, sum, reliability, rated (see `_COLUMNS`).
+Values = dict[str, NDArray]
+
+
+def _no_values() -> Values:
+    return {name: np.empty(0, kind) for name, (kind, _) in _COLUMNS.items()}
+
+
+def _joined(values: Values, order: NDArray[np.int64], first: NDArray[np.int64]) -> Values:
+    """Return values of records (n,) in an order, of which those from each `first` on are joined."""
+    return {
+        name: join.reduceat(values[name][order], first, dtype=kind)
+        for name, (kind, join) in _COLUMNS.items()
+    }
+
+
+def _concatenated(parts: Sequence[Values]) -> Values:
+    return {name: np.concatenate([part[name] for part in parts]) for name in _COLUMNS}
+
+
+@dataclass
+class WireCubes:
+    """Records of the cubes that hold points of wires, in the order of their places."""
+
+    size: float  #: side of a cube, meters
+    #: (n, 3) column, row and layer
+    place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 3), np.int64))
+    columns: Values = field(default_factory=_no_values)  #: (n,) each
+
+    @staticmethod
+    def places(x: NDArray, y: NDArray, z: NDArray, size: float) -> NDArray[np.int64]:
+        """Return column, row and layer (n, 3) of the cubes of points, whose axes are in meters."""
+        return np.column_stack([cell_numbers(axis / size, 1.0) for axis in (x, y, z)])
+
+    def middles(self) -> NDArray[np.float64]:
+        """Return where the wires of each cube are (n, 3), meters: its middle, their mean height."""
+        height = self.columns["sum"] / self.columns["count"] / MM
+        return np.column_stack([(self.place[:, :2] + 0.5) * self.size, height])
+
+    def rows(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the row of the cube at each place (n, 3); -1 for none."""
+        count = len(self.place)
+        every = np.concatenate([self.place, places])
+        _, number = np.unique(every, axis=0, return_inverse=True)
+        row = np.full(len(every), -1, np.int64)
+        row[number.reshape(-1)[:count]] = np.arange(count)
+        return row[number.reshape(-1)[count:]]
+
+    def doubled(self) -> WireCubes:
+        """Return records of the same points in cubes twice as wide."""
+        return WireCubes(2 * self.size, self.place >> 1, self.columns).merged()
+
+    def merged(self) -> WireCubes:
+        """Return the records sorted, with one for each cube."""
+        order = np.lexsort(self.place.T[::-1])
+        place = self.place[order]
+        first = np.flatnonzero((np.diff(place, axis=0, prepend=place[:1] - 1) != 0).any(axis=1))
+        if not len(first):
+            return WireCubes(self.size)
+        return WireCubes(self.size, place[first], _joined(self.columns, order, first))
+
+
 @dataclass
 class Cells:
     """Records of cells, sorted by key; make them with :meth:`from_points`."""
 
     size: float  #: side of a cell, meters; cells of the ground are `GROUND_WIDTH` times as wide
     key: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  #: (n,)
-    #: (n,) arrays by name: count, low, high, sum, reliability, rated (see `_COLUMNS`)
-    columns: dict[str, NDArray] = field(
-        default_factory=lambda: {name: np.empty(0, kind) for name, (kind, _) in _COLUMNS.items()}
-    )
+    columns: Values = field(default_factory=_no_values)  #: (n,) each
+    wires: WireCubes = field(default_factory=lambda: WireCubes(0.0))  #: as wide as the cells
 
     def __len__(self) -> int:
         """Return the number of records."""
@@ -157,12 +217,17 @@ class Cells:
             "reliability": thousandths.astype(np.int64),
             "rated": rated.astype(np.int32),
         }
-        return cls(size, key, columns)._merged()
+        wire = np.flatnonzero(kinds[used] == Kind.SPAN)
+        along_x, along_y, along_z = (axis[used][wire] for axis in (x, y, z))
+        places = WireCubes.places(along_x, along_y, along_z, size)
+        wires = WireCubes(size, places, {name: each[wire] for name, each in columns.items()})
+        return cls(size, key, columns, wires.merged())._merged()
 
     def doubled(self) -> Cells:
         """Return records of the same points in cells twice as wide."""
         column, row, kind = split_keys(self.key)
-        return Cells(2 * self.size, cell_keys(column >> 1, row >> 1, kind), self.columns)._merged()
+        key = cell_keys(column >> 1, row >> 1, kind)
+        return Cells(2 * self.size, key, self.columns, self.wires.doubled())._merged()
 
     def _merged(self) -> Cells:
         """Return the records sorted, with one for each cell."""
@@ -171,21 +236,21 @@ class Cells:
         order = np.argsort(self.key, kind="stable")
         key = self.key[order]
         first = np.flatnonzero(begins_run(key))
-        columns = {
-            name: join.reduceat(self.columns[name][order], first, dtype=kind)
-            for name, (kind, join) in _COLUMNS.items()
-        }
-        return Cells(self.size, key[first], columns)
+        return Cells(self.size, key[first], _joined(self.columns, order, first), self.wires)
 
     @staticmethod
     def join(parts: Sequence[Cells]) -> Cells:
         """Return records of the points of all parts together; cells of all parts have one size."""
         if len(parts) == 1:
             return parts[0]
-        columns = {
-            name: np.concatenate([part.columns[name] for part in parts]) for name in _COLUMNS
-        }
-        return Cells(parts[0].size, np.concatenate([part.key for part in parts]), columns)._merged()
+        size, columns = parts[0].size, _concatenated([part.columns for part in parts])
+        wires = WireCubes(
+            size,
+            np.concatenate([part.wires.place for part in parts]),
+            _concatenated([part.wires.columns for part in parts]),
+        )
+        key = np.concatenate([part.key for part in parts])
+        return Cells(size, key, columns, wires.merged())._merged()
 
     def of_kind(self, kind: Kind) -> Cells:
         """Return the records of one kind."""
@@ -200,7 +265,8 @@ class Cells:
         return part._select(window.contains(*split_keys(part.key)[:2]))
 
     def _select(self, rows: slice | NDArray[np.bool_]) -> Cells:
-        return Cells(self.size, self.key[rows], {name: v[rows] for name, v in self.columns.items()})
+        values = {name: each[rows] for name, each in self.columns.items()}
+        return Cells(self.size, self.key[rows], values)
 
     def sparse_kind(self) -> tuple[str, float] | None:
         """Return a kind with too few points for this cell size, and its mean per cell; or None.

@@ -1,10 +1,11 @@
 """Detect all objects in records of cells, block by block of the absolute grid.
 
 Memory is that of one block with its surroundings, and of the objects. A block is seen with
-`MARGIN` around it, within which ground and crowns are those of the whole area; where a building,
-span or deck that reaches into the block comes near the rim of the view, the view is widened. An
-object belongs to the block that its first cell (a tree: its top) lies in. So blocks, and tiles
-with as much around them, give exactly the objects of the whole area.
+`MARGIN` around it, within which ground and crowns are those of the whole area; where a building or
+deck that reaches into the block comes near the rim of the view, the view is widened. An object
+belongs to the block that its first cell (a tree: its top) lies in. So blocks, and tiles with as
+much around them, give exactly the objects of the whole area. Spans of wires, which are few, are
+found in the whole area at once (:mod:`.spans`).
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ import scipy
 from numpy.typing import NDArray
 
 from ..base.grid import GridWindow, cell_keys, split_keys
+from ..base.hashing import hash_rows
 from ..base.json_types import JsonObject
 from ..base.progress import Progress
 from . import attributes, crowns
 from .attributes import ObjectCells
-from .cells import Cells, Kind, object_id
-from .raster_view import MARGIN, NEIGHBORS, CellView, pad_evenly
+from .cells import MM, Cells, Kind, WireCubes, object_id
+from .raster_view import MARGIN, CellView, pad_evenly
 from .results import Objects, ObjectSettings, ObjectTable
+from .spans import number_spans
 
 # `LOOKAHEAD` and `BLOCK` change time and memory, not results. The other values are not tuned.
 #: Meters beyond `MARGIN` in the first view: most buildings that reach into a block end there.
@@ -33,11 +36,6 @@ LOOKAHEAD = 64.0
 BLOCK = 2048
 #: Vegetation on a roof counts as roof up to this height above it (chimneys, gutters), meters.
 ROOF_TOLERANCE = 0.5
-#: Fewest cells of a span.
-MIN_SPAN_CELLS = 4
-#: Gap between wires that separates two spans, meters, rounded to an even number of cells; where
-#: that is 0, wires in cells that touch, also at a corner, are one span.
-SPAN_GAP = 2.0
 
 
 class _Object(NamedTuple):
@@ -70,26 +68,33 @@ def find_objects(
     """
     settings = replace(settings or ObjectSettings(), cell=cells.size)
     kinds_of_block: dict[tuple[int, int], list[Kind]] = {}
-    for kind in _DETECTORS:
+    for kind in (*_DETECTORS, Kind.SPAN):
         column, row, _ = split_keys(cells.of_kind(kind).key)
         for j, i in np.unique(np.stack([row // block, column // block]), axis=1).T.tolist():
             kinds_of_block.setdefault((j, i), []).append(kind)
-    detected: dict[Kind, list[_Object]] = {kind: [] for kind in _DETECTORS}
+    detected: dict[Kind, list[_Object]] = {kind: [] for kind in (*_DETECTORS, Kind.SPAN)}
+    wire_cells = cells.of_kind(Kind.SPAN).key
+    ground = np.full(len(wire_cells), np.nan)
     with Progress(len(kinds_of_block), "objects", "blocks", enabled=progress) as progress_line:
         for (j, i), kinds in kinds_of_block.items():
             core = GridWindow(i * block, j * block, block, block)
             window = pad_evenly(core, round((MARGIN + LOOKAHEAD) / cells.size))
             view = CellView(cells, window, settings)
             for kind in kinds:
-                detected[kind] += _DETECTORS[kind](view, core, kind)
+                if kind == Kind.SPAN:
+                    key, height = view.ground_below(kind, core)
+                    ground[np.searchsorted(wire_cells, key)] = height
+                else:
+                    detected[kind] += _DETECTORS[kind](view, core, kind)
             progress_line.update()
     every = [each for objects in detected.values() for each in objects]
+    detected[Kind.SPAN], span = _find_spans(cells.wires, wire_cells, ground)
     key = np.concatenate([np.empty(0, np.int64), *(each.keys for each in every)])
     identities = np.array([each.identity for each in every], np.int64)
     owner = np.repeat(identities, [len(each.keys) for each in every])
     order = np.argsort(key, kind="stable")
     tables = {kind: _table(objects) for kind, objects in detected.items()}
-    return Objects(settings, tables, key[order], owner[order])
+    return Objects(settings, tables, key[order], owner[order], cells.wires, span)
 
 
 def _table(objects: list[_Object]) -> ObjectTable:
@@ -128,22 +133,36 @@ def _detect_surfaces(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_
     return _measured(view, label, owner, z, core, kind, measure)
 
 
-def _detect_spans(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
-    """Yield spans: wires, joined over gaps."""
-    half_gap = round(SPAN_GAP / 2 / view.settings.cell)
+def _find_spans(
+    wires: WireCubes, wire_cells: NDArray[np.int64], ground: NDArray[np.float64]
+) -> tuple[list[_Object], NDArray[np.int64]]:
+    """Return all spans, and the id (w,) of the one that each cube of wires is part of; 0 for none.
 
-    def mask_of(view: CellView) -> NDArray[np.bool_]:
-        wire = view.indices(kind) >= 0
-        if half_gap:
-            return scipy.ndimage.binary_dilation(wire, NEIGHBORS, iterations=half_gap)
-        return wire
-
-    view, mask = view.widened_to_whole(core, mask_of)
-    high = view.highest(kind)
-    # In cells too wide for a gap, those of a diagonal wire touch at their corners alone.
-    joined, _ = scipy.ndimage.label(mask, None if half_gap else NEIGHBORS)
-    label = _without_small(np.where(np.isnan(high), -1, joined - 1), MIN_SPAN_CELLS)
-    return _measured(view, label, label, high, core, kind, attributes.measure_span)
+    `ground` (m,) is the height of the ground below cells with wires, by their sorted keys.
+    """
+    number = number_spans(wires)
+    spans, identity = [], np.zeros(len(number), np.int64)
+    column, row, _ = wires.place.T
+    below = ground[np.searchsorted(wire_cells, cell_keys(column, row, Kind.SPAN))]
+    values = wires.columns
+    order = np.argsort(number, kind="stable")[np.count_nonzero(number < 0) :]
+    for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else ():
+        cells = ObjectCells(
+            row[rows],
+            column[rows],
+            values["high"][rows] / MM,
+            values["low"][rows] / MM,
+            below[rows],
+            values["count"][rows].astype(np.int64),
+            values["reliability"][rows].astype(np.float64),
+            values["rated"][rows].astype(np.int64),
+        )
+        # Conductors above each other begin in the same cell: the id is of the first cube.
+        first = hash_rows(wires.place[rows[:1]].T, 0).astype(np.int64)
+        identity[rows] = object_id(Kind.SPAN, first >> 25, first)[0]
+        record = attributes.measure_span(cells, wires.size)
+        spans.append(_Object(int(identity[rows[0]]), record, cells, np.empty(0, np.int64)))
+    return spans, identity
 
 
 def _detect_trees(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Object]:
@@ -176,7 +195,6 @@ def _detect_trees(view: CellView, core: GridWindow, kind: Kind) -> Iterator[_Obj
 _DETECTORS = {
     Kind.BUILDING: _detect_surfaces,
     Kind.TREE: _detect_trees,
-    Kind.SPAN: _detect_spans,
     Kind.DECK: _detect_surfaces,
 }
 

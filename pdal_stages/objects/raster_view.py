@@ -119,6 +119,15 @@ class CellView:
         filled = roofs.fill_holes(high, occupied, round(MAX_HOLE_DEPTH / settings.cell))
         return roofs.roof_cells(filled)
 
+    def ground_below(
+        self, kind: Kind, core: GridWindow
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the keys (n,) of a kind's cells in a block, and the ground's height there."""
+        place = self._slices(core)
+        index, ground = self.indices(kind)[place], self.ground[place]
+        inside = index >= 0
+        return self._records[kind].key[index[inside]], ground[inside]
+
     def object_cells(self, kind: Kind, r: NDArray, c: NDArray, z: NDArray) -> ObjectCells:
         """Return the cells of an object at rows `r`, columns `c` of the view, at heights `z`."""
         columns, index = self._records[kind].columns, self.indices(kind)[r, c]

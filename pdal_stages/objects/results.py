@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..base.grid import places_among
 from ..base.json_types import JsonObject
 from ..base.options import Settings, setting
-from .cells import Kind, point_keys
+from .cells import Kind, WireCubes, point_keys
 
 
 def _number(limits: tuple[float, float, float, str], help: str) -> Any:
@@ -72,10 +72,12 @@ class Objects:
 
     settings: ObjectSettings
     tables: dict[Kind, ObjectTable]
-    key: NDArray[np.int64]  #: (m,) sorted keys of cells that belong to objects
+    key: NDArray[np.int64]  #: (m,) sorted keys of cells that belong to objects but spans
     owner: NDArray[np.int64]  #: (m,) id of the object that has their points
+    wires: WireCubes  #: cubes of wires ...
+    span: NDArray[np.int64]  #: (w,) ... and the id of the span that has their points; 0 for none
 
-    def ids_at(self, x: NDArray, y: NDArray, kinds: NDArray) -> NDArray[np.int64]:
+    def ids_at(self, x: NDArray, y: NDArray, z: NDArray, kinds: NDArray) -> NDArray[np.int64]:
         """Return the id of each point's object, 0 for none; `kinds`: :class:`Kind`, or -1."""
         ids = np.zeros(len(x), np.int64)
         if self.key.size:
@@ -83,6 +85,9 @@ class Objects:
             keys = point_keys(x[rows], y[rows], kinds[rows], self.settings.cell)
             place, exists = places_among(self.key, keys)
             ids[rows] = np.where(exists, self.owner[place], 0)
+        rows = np.flatnonzero(kinds == Kind.SPAN)
+        places = WireCubes.places(x[rows], y[rows], z[rows], self.settings.cell)
+        ids[rows] = np.append(self.span, 0)[self.wires.rows(places)]
         return ids
 
     def summary(self) -> dict[str, JsonObject]:

@@ -155,7 +155,8 @@ class GroupObjects(ObjectOptions, Stage, settings=ObjectSettings):
         """Return the number of each point's object (n,); 0 for points of none."""
         kinds = kind_of_code(self.classes)[points.class_codes]
         kinds[~points.inside | points.chosen(self.ignore)] = -1
-        return objects.ids_at(points.xyz[:, 0], points.xyz[:, 1], kinds)
+        x, y, z = points.xyz.T
+        return objects.ids_at(x, y, z, kinds)
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Find objects and number their points."""
