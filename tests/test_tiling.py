@@ -96,9 +96,7 @@ def test_one_file_comes_back_bit_for_bit(tmp_path, town_file, model_file, whole)
     x, y = (np.asarray(v) for v in (laspy.read(town_file).x, laspy.read(town_file).y))
     assert np.isin(x, 500_000.0 + np.array([10.0, 40.0, 70.0])).sum() > 10
     assert np.count_nonzero(y == 5_400_030.0) > 10
-    assert any(
-        job.record["read"] < run.summary["points"] for job in run.tiles
-    )  # some were really cut
+    assert any(job.record.read < run.summary["points"] for job in run.tiles)  # some were really cut
     clouds.same_points(whole, tmp_path / "out.laz")
     counted = np.bincount(np.asarray(laspy.read(whole).classification), minlength=7)
     assert run.summary["classes"] == {str(c): int(counted[c]) for c in np.flatnonzero(counted)}
@@ -306,8 +304,8 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las,
     ps.Pipeline(job("a.las")).execute(arrays=False)
     run = run_tiled(job("b.las"), 60, workers=0)
     assert not run.failures and not any("may differ" in note for note in run.messages)
-    assert any(job.record["widened"] for job in run.tiles) and not any(
-        job.record["short"] for job in run.tiles
+    assert any(job.record.widened for job in run.tiles) and not any(
+        job.record.short for job in run.tiles
     )
     clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
     if len(stages) == 2 and stages[0].get("tag"):
@@ -315,7 +313,7 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las,
             job("c.las"), 60, workers=0, most_points=50
         )  # no room to widen: said, not hidden
         assert any("may differ" in note for note in run.messages)
-        assert any(job.record["short"] for job in run.tiles)
+        assert any(job.record.short for job in run.tiles)
 
 
 @settings(max_examples=20, deadline=None)

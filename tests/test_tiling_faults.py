@@ -520,7 +520,7 @@ def test_a_far_input_that_a_widened_tile_read(tmp_path, write_las):
     writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las"), "extra_dims": "all"}
     stages = [{"type": "readers.las", "filename": str(tmp_path / "?.las")}, features, writer]
     first = run_tiled(stages, 60, workers=0)
-    wide = {job.name: job.record["halo_m"] for job in first.tiles}
+    wide = {job.name: job.record.halo_m for job in first.tiles}
     assert wide["0_0"] > 60, wide  # which reaches c
     xyz = rng.uniform(0, 1, (60, 3)) * (59.9, 60, 5) + (120, 0, 0)
     write_las(tmp_path / "c.las", dict(zip("XYZ", xyz.T, strict=True)))

@@ -67,8 +67,8 @@ def test_tiles_are_the_same_bits_and_read_few_points(tmp_path, survey, before):
     whole = np.concatenate(ps.run_pipeline([*survey, *before, HEIGHTS]).arrays)
     for name in MADE:
         assert np.array_equal(of_files(tmp_path / "out", name), whole[name]), name
-    read = sum(job.record["read"] for job in run.tiles)
-    ours = sum(job.record["points"] for job in run.tiles)
+    read = sum(job.record.read for job in run.tiles)
+    ours = sum(job.record.points for job in run.tiles)
     assert read <= 1.01 * ours  # what noise marked is kept
     assert not list((tmp_path / "out" / ".pdal-stages" / "kept").glob("*.np[yz]"))
 

@@ -21,7 +21,7 @@ from ..tiling.options import PER, TilingOptions
 from .parser import Parser
 
 if TYPE_CHECKING:
-    from ..tiling.jobs import Job, TiledRun
+    from ..tiling.jobs import TiledRun, WritingJob
 
 #: Failures that are printed, a screenful; reports hold all of them.
 _MOST_FAILURES = 20
@@ -146,16 +146,16 @@ def print_classes(
         print(f"  {describe_count(name):32s} {points:>12,}")
 
 
-def print_output(job: Job, names: Mapping[int, str]) -> None:
+def print_output(job: WritingJob, names: Mapping[int, str]) -> None:
     """Print a finished output, as ``out.laz: 500 points; 2 ground 61.3 %, 6 building 12.0 %``."""
-    assert job.outputs is not None
-    classes = {int(code): n for code, n in job.record.get("classes", {}).items()}
+    assert job.outputs is not None and job.record is not None
+    classes = {int(code): n for code, n in (job.record.classes or {}).items()}
     total = sum(classes.values())
     shares = ", ".join(
         f"{code} {names.get(code, class_name(code))} {100.0 * n / total:.1f} %"
         for code, n in sorted(classes.items())
     )
-    points = count_of(job.record.get("written", 0), "point")
+    points = count_of(job.record.written or 0, "point")
     print(f"{one_line(job.outputs[0])}: {points}{f'; {shares}' if shares else ''}", flush=True)
 
 

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -35,14 +35,22 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
+@dataclass(frozen=True)
+class Cost:
+    """What a task took."""
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    peak_mb: float = 0.0  #: the most memory that the process has held so far
+
+
 @dataclass
 class TaskResult:
     """The result of a task."""
 
     result: Any = None
     reason: str = ""  #: why it failed; empty where it did not
-    #: ``seconds``, ``cpu_seconds``, ``peak_mb`` (the most memory the process has held so far).
-    cost: dict[str, float] = field(default_factory=dict)
+    cost: Cost = Cost()
 
 
 def perform_task(task: Task) -> TaskResult:
@@ -56,11 +64,7 @@ def perform_task(task: Task) -> TaskResult:
             raise KeyboardInterrupt from None
         except Exception as error:
             out.reason = _reason(error)
-        out.cost = {
-            "seconds": time.perf_counter() - started,
-            "cpu_seconds": time.process_time() - cpu,
-            "peak_mb": _peak(),
-        }
+        out.cost = Cost(time.perf_counter() - started, time.process_time() - cpu, _peak())
         return out
 
 

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from ..base import checks
 from ..base.asprs import NOISE, TERRAIN, WIRES_AND_TOWERS
 from ..base.grid import GridWindow, begins_run, cell_numbers
-from ..base.json_types import JsonObject
 from ..tiling.inputs import LonePoints
 from ..tiling.options import LARGEST_TILE, TILE_POINT, Density, TileGrid
-from ..tiling.tile_records import Part
+from ..tiling.tile_records import Part, Reduced
 from .triangulation import NEAR, SPLIT
 
 Integers = NDArray[np.int64]
@@ -113,9 +112,17 @@ def usable(part: Mapping[str, NDArray], lone: LonePoints) -> NDArray[np.bool_]:
     return kept & ~lone.among(part["X"], part["Y"])
 
 
+@dataclass
+class TileFigures(Reduced):
+    """Figures of a tile that was reduced to cells."""
+
+    window: Sequence[int]  #: of the cells with points, as :class:`GridWindow` has it
+    ground: int  #: number of ground points
+
+
 def reduce_points(
     parts: Sequence[Part], lone: LonePoints, options: SurfaceOptions, unit: float
-) -> tuple[dict[str, NDArray], JsonObject]:
+) -> tuple[dict[str, NDArray], TileFigures]:
     """Reduce the usable points of a tile (files and their dimensions) to cells.
 
     `unit` is that of the coordinates, in meters.
@@ -126,8 +133,7 @@ def reduce_points(
         ``ground`` (k, 3) int64: points in steps; ``top`` and ``solid``, rasters as of
         :meth:`CellRule.rasterize`: twice the greatest height in steps, plus 1 where that is not
         ground; of ``solid`` without wires and towers.
-    figures : dict
-        ``window`` of all points, and ``ground``: the number of ground points.
+    figures : TileFigures
     """
     columns = [np.empty((0, 4), np.int64)]
     for _, part in parts:
@@ -141,7 +147,7 @@ def reduce_points(
     low = ~np.isin(codes, WIRES_AND_TOWERS)
     arrays = HIGHEST.rasterize("top", cells, value)
     arrays |= HIGHEST.rasterize("solid", cells[:, low], value[low])
-    figures = {"window": arrays["top_window"].tolist(), "ground": len(ground)}
+    figures = TileFigures(arrays["top_window"].tolist(), len(ground))
     return {"ground": ground, **arrays}, figures
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import NDArray
 
@@ -20,8 +19,8 @@ from ..base.messages import print_messages
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.options import TilingOptions
 from ..tiling.tile_records import RecordRun, RecordSurvey, Tile, record_run
-from .cells import CellDensity, SurfaceOptions, reduce_points
-from .rasters import RASTERS, TileCells, compute_tile
+from .cells import CellDensity, SurfaceOptions, TileFigures, reduce_points
+from .rasters import RASTERS, RasterFigures, TileCells, compute_tile
 
 #: Share of cells with a height below which a message says so: 0.1 % are a line 100 m wide that
 #: crosses 70 km.
@@ -77,37 +76,38 @@ def _run(run: RecordRun, paths: dict[str, Path], options: SurfaceOptions) -> Jso
     """Compute all tiles, and write the rasters."""
     survey = run.survey
     reduce = partial(reduce_points, options=options, unit=survey.unit)
-    reduced = run.reduce("cells", asdict(options), reduce)
-    if not any(job.record["ground"] for job in reduced):
+    reduced = run.reduce("cells", asdict(options), reduce, TileFigures)
+    if not any(job.figures.ground for job in reduced):
         raise StageError(
             "no point is ground (classes 2, 9, 11), so there is no terrain",
             found=", ".join(survey.paths[:3]),
             cure="Classify the files first: pdal-stages classify raw.laz classified.laz",
         )
-    window = GridWindow.union(GridWindow(*job.record["window"]) for job in reduced)
+    window = GridWindow.union(GridWindow(*job.figures.window) for job in reduced)
     size = options.resolution
     x0, y0, wide, tall = (number * size for number in window)
     cells = TileCells(options, survey.grid, survey.unit, window, {})
     centers = x0 + size / 2, y0 + size / 2, x0 + wide - size / 2, y0 + tall - size / 2
 
-    def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Any]:
+    def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], RasterFigures]:
         return partial(compute_tile, replace(cells, files=files), tile, target)
 
     tiles = survey.grid.covering(centers)
-    jobs = run.compute("rasters", reduced, tiles, cells.reach + size, compute)
+    jobs = run.compute("rasters", reduced, tiles, cells.reach + size, compute, RasterFigures)
 
     def parts(name: str) -> Iterator[tuple[GridWindow, NDArray]]:
         for job in jobs:
             (arrays,) = run.arrays([job], name, "window")
             yield GridWindow(*arrays["window"].tolist()), arrays[name]
 
-    known = {name: sum(job.record[name] for job in jobs) for name in RASTERS}
+    counts = [job.figures.to_json() for job in jobs]
+    known = {name: sum(count[name] for count in counts) for name in RASTERS}
     if (share := known["surface"] / (window.width * window.height)) < _NEARLY_EMPTY:
-        held = [job for job in reduced if job.record["window"][2]]
+        held = [job for job in reduced if job.figures.window[2]]
         fullest = max(held, key=lambda job: job.points)
         far = max(held, key=lambda job: math.dist(job.tile, fullest.tile))
         file = survey.near(far.tile, 0.0)[0].path
-        x, y = (number * size for number in far.record["window"][:2])
+        x, y = (number * size for number in far.figures.window[:2])
         print_messages(
             f"{100 * share:.2g} % of {window.width:,} x {window.height:,} cells have a height: "
             f"points far from the others, as near {x:.0f} {y:.0f} of {file}, make the rasters this "

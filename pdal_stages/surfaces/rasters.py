@@ -14,9 +14,9 @@ from scipy import ndimage
 
 from ..base.errors import optional_import
 from ..base.grid import GridWindow
-from ..base.json_types import JsonObject
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.options import Box, TileGrid, touching
+from ..tiling.records import JobRecord
 from ..tiling.tile_records import Tile, cells_in_tile
 from .cells import EMPTY, HIGHEST, STEPS, Integers, SurfaceOptions, lowest
 from .triangulation import heights_at
@@ -84,7 +84,16 @@ class TileCells:
         return join("top"), join("solid")
 
 
-def compute_tile(cells: TileCells, tile: Tile, target: str) -> JsonObject:
+@dataclass
+class RasterFigures(JobRecord):
+    """Cells of a tile's rasters that have a height."""
+
+    terrain: int
+    surface: int
+    canopy: int
+
+
+def compute_tile(cells: TileCells, tile: Tile, target: str) -> RasterFigures:
     """Compute the rasters of a tile, save them, and return how many cells of each are known.
 
     The arrays are named as in :data:`RASTERS`, (rows, columns) float32 from the south with NaN for
@@ -106,7 +115,7 @@ def compute_tile(cells: TileCells, tile: Tile, target: str) -> JsonObject:
         arrays = {"terrain": terrain, "surface": top, "canopy": canopy}
     rounded = {name: np.round(values, 3).astype(np.float32) for name, values in arrays.items()}
     save_arrays(target, {**rounded, "window": np.array(window)})
-    return {name: int(np.isfinite(values).sum()) for name, values in rounded.items()}
+    return RasterFigures(**{n: int(np.isfinite(values).sum()) for n, values in rounded.items()})
 
 
 def _terrain(cells: TileCells, window: GridWindow) -> Floats:

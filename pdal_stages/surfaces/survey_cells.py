@@ -17,7 +17,8 @@ from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
 from ..tiling.inputs import LonePoints
 from ..tiling.jobs import load_arrays, save_arrays
-from ..tiling.tile_records import Part
+from ..tiling.records import JobRecord
+from ..tiling.tile_records import Part, Reduced
 from .cells import HIGHEST, STEPS, CellRule, Integers, cells_at, steps, usable
 
 #: Of points without times: a first time that is later than all.
@@ -90,9 +91,24 @@ def _is_last(part: Mapping[str, NDArray]) -> NDArray[np.bool_]:
     return part["ReturnNumber"] >= part["NumberOfReturns"]
 
 
+@dataclass
+class ReportFigures(Reduced):
+    """Figures of a tile that was reduced for the report."""
+
+    files: Mapping[str, JsonObject]  #: see :func:`describe`, by path
+    repeated: int  #: points that come twice
+
+
+@dataclass
+class Differences(JobRecord):
+    """Cells of a tile in which strips were compared."""
+
+    cells: int
+
+
 def reduce_tile(
     parts: Sequence[Part], lone: LonePoints, rules: ReportRules, control: NDArray[np.float64]
-) -> tuple[dict[str, NDArray], JsonObject]:
+) -> tuple[dict[str, NDArray], ReportFigures]:
     """Reduce points of a tile: files and their dimensions.
 
     Returns
@@ -103,8 +119,7 @@ def reduce_tile(
         in steps + class of the highest point. ``strips`` (k, 5) int64: source, column, row, sum of
         heights in steps, and number of ground points. ``control`` (m, 3) int64: ground points near
         control points (c, 2), in steps. Points that are not usable or come twice are left out.
-    figures : dict
-        ``files``: see :func:`describe`; ``repeated``: points that come twice.
+    figures : ReportFigures
     """
     columns, distinct = [np.empty((0, 6), np.int64)], DistinctPoints()
     for _, part in parts:
@@ -132,8 +147,8 @@ def reduce_tile(
         near |= np.hypot(*(ground[:, :2] - place).T) <= rules.around_control * STEPS
     arrays["strips"] = sum_up(keys, ground[:, 2])
     arrays["control"] = ground[near]
-    figures = {"files": {path: describe(part) for path, part in parts}}
-    return arrays, {**figures, "repeated": distinct.repeated}
+    files = {path: describe(part) for path, part in parts}
+    return arrays, ReportFigures(files, distinct.repeated)
 
 
 def sum_up(keys: Integers, values: Integers) -> Integers:
@@ -146,7 +161,9 @@ def sum_up(keys: Integers, values: Integers) -> Integers:
     return np.column_stack([keys[start], total, np.diff(start, append=len(keys))])
 
 
-def compare_strips(files: list[str], window: GridWindow, rules: ReportRules, target: str) -> dict:
+def compare_strips(
+    files: list[str], window: GridWindow, rules: ReportRules, target: str
+) -> Differences:
     """Compare the ground of strips in a window of cells; save and return what differs.
 
     The arrays are ``differences`` (k, 4) int64: a source, a greater one, the greater one's mean
@@ -187,4 +204,4 @@ def compare_strips(files: list[str], window: GridWindow, rules: ReportRules, tar
     arrays |= RASTERS["differing"].rasterize("differing", cells, 0 * value + 1)
     arrays |= RASTERS["squares"].rasterize("squares", cells, value**2)
     save_arrays(target, arrays)
-    return {"cells": len(rows)}
+    return Differences(len(rows))

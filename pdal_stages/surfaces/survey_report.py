@@ -23,10 +23,26 @@ from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
 from ..tiling.jobs import Job
 from ..tiling.options import TilingOptions
-from ..tiling.tile_records import RecordRun, RecordSurvey, Tile, cells_in_tile, record_run
+from ..tiling.tile_records import (
+    RecordJob,
+    RecordRun,
+    RecordSurvey,
+    Tile,
+    cells_in_tile,
+    record_run,
+)
 from .cells import STEPS, CellDensity, SurfaceOptions, lowest
 from .report_page import render_report
-from .survey_cells import RASTERS, ReportRules, combine, compare_strips, figures_of, reduce_tile
+from .survey_cells import (
+    RASTERS,
+    Differences,
+    ReportFigures,
+    ReportRules,
+    combine,
+    compare_strips,
+    figures_of,
+    reduce_tile,
+)
 from .triangulation import Box, heights_at
 
 #: Width of pictures in pixels, and voids and control points that are listed, as many as fit a page.
@@ -111,9 +127,9 @@ def _measure(
     places = np.array([point[:2] for point in control]).reshape(-1, 2)
     settings = {**asdict(rules), "places": places.tolist()}
     reduce = partial(reduce_tile, rules=rules, control=places)
-    jobs = run.reduce("report", settings, reduce)
+    jobs = run.reduce("report", settings, reduce, ReportFigures)
     files: dict[str, list[Any]] = {}
-    for path, described in (item for job in jobs for item in job.record["files"].items()):
+    for path, described in (item for job in jobs for item in job.figures.files.items()):
         files.setdefault(path, []).append(described)
     by_file = {path: combine(files[path]) for path in survey.paths if path in files}
     whole = {name: _merge(run, jobs, name) for name in ("all", "last", "void", "picture")}
@@ -130,7 +146,7 @@ def _measure(
         "meters_per_unit": {"horizontal": units.horizontal, "vertical": units.vertical},
         "survey": figures_of(combine([*by_file.values()])),
         "files": {path: figures_of(described) for path, described in by_file.items()},
-        "repeated": sum(job.record["repeated"] for job in jobs),
+        "repeated": sum(job.figures.repeated for job in jobs),
         **figures,
         "strips": _strips(run, compared, units.vertical),
         "control": _control(run, jobs, control, rules, units.vertical) if control else None,
@@ -194,14 +210,17 @@ def _density(
     return {"area_m2": area, "density": density, "voids": listed}, is_void[label]
 
 
-def _compare_strips(run: RecordRun, jobs: Sequence[Job], rules: ReportRules) -> list[Job]:
+def _compare_strips(
+    run: RecordRun, jobs: Sequence[RecordJob[ReportFigures]], rules: ReportRules
+) -> Sequence[Job]:
     """Compare the ground of strips in all tiles; return the jobs."""
 
-    def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Any]:
+    def compute(tile: Tile, files: dict[Tile, str], target: str) -> Callable[[], Differences]:
         window = cells_in_tile(run.survey.grid, tile, rules.strip)
         return partial(compare_strips, [*files.values()], window, rules, target)
 
-    return run.compute("strips", jobs, [job.tile for job in jobs], 2 * rules.strip, compute)
+    tiles = [job.tile for job in jobs]
+    return run.compute("strips", jobs, tiles, 2 * rules.strip, compute, Differences)
 
 
 def _strips(run: RecordRun, compared: Sequence[Job], vertical: float) -> list[JsonObject]:

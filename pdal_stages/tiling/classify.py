@@ -19,8 +19,9 @@ from ..pipeline.inputs_outputs import input_files, is_folder, is_las, outputs_of
 from ..pipeline.pdal import knows_copc, writer_of
 from ..stages.where_expression import Expression
 from .inputs import InputSource, one_format
-from .jobs import Job, TiledRun
+from .jobs import OutputJob, TiledRun, WritingJob
 from .options import TilingOptions, fits_whole
+from .records import OutputRecord
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class ClassifyTask:
             "inputs": 1,
             "bounds": list(header.box) if header and header.count else None,
         }
-        output = Job(source, source=InputSource(source, {}), outputs=[target])
+        output = OutputJob(source, source=InputSource(source, {}), outputs=[target])
         if dry_run:
             self.request.pipeline(source, target)
             check_outputs(self.extra_files, self.inputs)
@@ -104,7 +105,7 @@ class ClassifyTask:
         reports = [each[-1] for _, each in pipeline.reports if each]
         classes = [report.codes for report in reports if report.codes is not None][-1:]
         output.state = "done"
-        output.record = {"written": count, "classes": classes[0] if classes else {}}
+        output.record = OutputRecord([], count, classes[0] if classes else {})
         seconds = time.perf_counter() - seconds
         summary |= {
             "points": count,
@@ -112,13 +113,13 @@ class ClassifyTask:
             "points_per_second": count / seconds if seconds else 0.0,
             "cpu_seconds": time.process_time() - cpu_seconds,
             "states": {},
-            "classes": output.record["classes"],
+            "classes": output.record.classes,
             "point_counts": pipeline.point_counts,
         }
         return TiledRun([], [output], {}, [], messages, summary, metadata=pipeline.metadata)
 
     def run_tiles(
-        self, *, dry_run: bool = False, finished: Callable[[Job], None] | None = None
+        self, *, dry_run: bool = False, finished: Callable[[WritingJob], None] | None = None
     ) -> TiledRun:
         """Classify all inputs in tiles; call `finished` with every output that was written."""
         from .plan import plan_of_files

@@ -18,9 +18,10 @@ from ..pipeline.run import Pipeline
 from ..pipeline.runtime import ExpandedStage
 from ..stages.base import FarReaching, inside_block
 from ..stages.registry import stage_types
-from .jobs import SavedArrays, load_arrays, save_arrays, written
+from .jobs import SavedArrays, load_arrays, save_arrays
 from .options import Box, TileGrid
 from .plan import RunContext
+from .records import FilesRecord, describe_written
 from .sorted_points import Piece
 
 #: Dimension -> rows of a piece and their new values.
@@ -70,8 +71,8 @@ def block_name(block: tuple[int, int]) -> str:
 
 def make_block(
     context: RunContext, block: tuple[int, int], squares: Sequence[str], target: str
-) -> JsonObject:
-    """Save a block of the raster, computed from the files of squares around it; return a record."""
+) -> FilesRecord:
+    """Save a block of the raster, computed from the files of squares around it."""
     blocks = context.plan.blocks
     assert blocks is not None
     low_x, low_y, high_x, high_y = TileGrid(blocks.side).box(block, blocks.reach)
@@ -83,7 +84,7 @@ def make_block(
     files = (load_arrays(path, [inside_block(block)]) for path in squares)
     inside = (points for arrays in files for points in arrays.values())
     save_arrays(target, far_reaching(context).compute_block(np.concatenate(parts), inside, block))
-    return {"outputs": written([target])}
+    return FilesRecord(describe_written([target]))
 
 
 def blocks_near(context: RunContext, box: Box, distance_m: float) -> list[tuple[int, int]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .inputs import Survey
-from .jobs import Job, TiledRun
+from .jobs import TiledRun, TileJob
 from .options import worker_bytes
 from .plan import TilePlan, outputs_for
 
@@ -17,7 +17,7 @@ _KEPT_OF_CELL = 112
 def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
     """Estimate a run from the headers of inputs: tiles, points, memory and disk (``--dry-run``)."""
     grid, options, density = survey.grid, survey.options, survey.density
-    tiles = [Job(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
+    tiles = [TileJob(grid.name(tile), points, tile) for tile, points in survey.tiles().items()]
     if options.per == "tile":
         outputs_for(plan, survey.paths, [job.name for job in tiles])
     count, read = density.points, density.read_by(grid.size, survey.halo_units)

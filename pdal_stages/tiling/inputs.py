@@ -40,6 +40,7 @@ from .options import (
     union,
 )
 from .plan import TilePlan, outputs_for
+from .records import JobRecord, RunGrids
 
 #: Side of a square in meters: ground points in squares that do not touch make no triangle whose
 #: circle has a radius of at most 100 m, the default of terrain models.
@@ -56,7 +57,7 @@ def sum_points(rows: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True)
-class CloudIndex:
+class CloudIndex(JobRecord):
     """The location of a file's points."""
 
     count: int
@@ -70,16 +71,23 @@ class CloudIndex:
     squares: NDArray[np.int64]  #: (k, 3): column and row in :attr:`Survey.lone_grid`, points
     copy: str = ""  #: the file with the points; empty where an earlier run had it
 
+    def to_json(self) -> JsonObject:
+        """Return all but the copy, which goes with the run."""
+        arrays = {"cells": self.cells.tolist(), "squares": self.squares.tolist()}
+        values = {**vars(self), **arrays, "grid": [self.grid.size, self.grid.origin]}
+        del values["copy"]
+        return values
+
     @classmethod
-    def parse(cls, record: JsonObject, copy: str = "") -> CloudIndex:
-        """Return the index that :func:`sort_points` has described."""
-        cells = np.array(record["cells"], np.int64).reshape(-1, 4)
-        tiles = [(i, j, n) for i, j, n in record["tiles"]]
-        grid = TileGrid(*map(float, record["grid"]))
-        digest, changed_ns = str(record["digest"]), int(record["changed_ns"])
-        box = tuple(record["box"])
-        squares = np.array(record["squares"], np.int64).reshape(-1, 3)
-        return cls(int(record["count"]), box, tiles, cells, grid, digest, changed_ns, squares, copy)
+    def from_json(cls, saved: JsonObject) -> CloudIndex:
+        """Return an index without its copy; ValueError, TypeError, ... where it is damaged."""
+        cells = np.array(saved["cells"], np.int64).reshape(-1, 4)
+        tiles = [(i, j, n) for i, j, n in saved["tiles"]]
+        grid = TileGrid(*map(float, saved["grid"]))
+        digest, changed_ns = str(saved["digest"]), int(saved["changed_ns"])
+        box = tuple(saved["box"])
+        squares = np.array(saved["squares"], np.int64).reshape(-1, 3)
+        return cls(int(saved["count"]), box, tiles, cells, grid, digest, changed_ns, squares)
 
     def is_of(self, path: str) -> bool:
         """Return whether the input still holds the bytes that were read.
@@ -200,12 +208,11 @@ class Survey:
     """The inputs of a run, and its options with tile size and number of workers decided."""
 
     def __init__(
-        self, plan: TilePlan, options: TilingOptions, earlier: JsonObject | None = None
+        self, plan: TilePlan, options: TilingOptions, earlier: RunGrids | None = None
     ) -> None:
         """Find and check the inputs, and choose tiles.
 
-        `earlier` is the :attr:`layout` of the run that this one resumes, where the user gives no
-        tile size.
+        `earlier` are the grids of the run that this one resumes, where the user gives no tile size.
         """
         self.started = time.strftime("%Y-%m-%d %H:%M")
         self.messages = list(plan.messages)
@@ -226,17 +233,17 @@ class Survey:
         self.block_bytes = (
             block_bytes(plan.blocks, self.density.area * self.unit**2) if plan.blocks else 0.0
         )
-        sized = replace(options, tile=earlier["tile"]) if earlier else options
+        sized = replace(options, tile=earlier.tile) if earlier else options
         self.options, self.grid = choose_tiles(
             sized, self.density, self.halo_units, self.block_bytes
         )
         if earlier:
-            self.grid = TileGrid(self.grid.size, earlier["origin"])
+            self.grid = TileGrid(self.grid.size, earlier.origin)
         square = 1
         if len(plan.rounds) > 1:
             halo = max(part.halo_m for part in plan.rounds) / self.unit
             square = tiles_per_square(self.options, self.density, self.grid.size, halo)
-        self.tiles_per_square = round(earlier["square"]) if earlier else square
+        self.tiles_per_square = earlier.square if earlier else square
         self.squares = self.grid.scaled(self.tiles_per_square)
 
     def _read_headers(self) -> None:
@@ -324,10 +331,9 @@ class Survey:
         return LonePoints(self.lone_grid, lone, box)
 
     @property
-    def layout(self) -> dict[str, float]:
-        """The grids, for a run that resumes this one with another amount of free memory."""
-        square = self.tiles_per_square
-        return {"tile": self.grid.size, "origin": self.grid.origin, "square": square}
+    def grids(self) -> RunGrids:
+        """Return the grids of the run."""
+        return RunGrids(self.grid.size, self.grid.origin, self.tiles_per_square)
 
     def place(self) -> None:
         """Collect the boxes of inputs from headers or indexes, as an array for fast comparison."""

@@ -11,7 +11,7 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,21 @@ from ..base.checks import strict_json
 from ..base.columns import LazyColumns
 from ..base.errors import StageError
 from ..base.files import make_own_folder, try_lock, whole_files
-from ..base.hashing import digest_of_file
 from ..base.json_types import JsonObject
 from ..base.messages import count_of
 from ..base.version import __version__
+from ..pipeline.workers import Cost
 from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR
-from .inputs import InputSource
+from .inputs import CloudIndex, InputSource
+from .records import (
+    ARRAYS,
+    FilesRecord,
+    JobRecord,
+    OutputRecord,
+    RunGrids,
+    TileRecord,
+    written_files,
+)
 
 #: Most distinct warnings of tiles that a run repeats (not tuned).
 _MOST_MESSAGES = 20
@@ -43,30 +52,22 @@ _CHANGED = (
 
 @dataclass
 class Job:
-    """A task of a run and its state: a tile, square, block or output, or an input to be read."""
+    """A task of a run and its state; subclasses tell what the task is about."""
 
     name: str  #: its key in the work folder
     points: int = 0  #: its own; 0 where unknown before it is read
-    tile: tuple[int, int] = (0, 0)  #: of a tile or block: column and row
-    source: InputSource | None = None  #: the input that an output is of
-    #: files of the writers; None for a tile whose points go into outputs of input files
-    outputs: list[str] | None = None
-    jobs: list[Job] = field(default_factory=list)  #: those that it needs: an output its tiles
-    digest: str = ""  #: fingerprint of everything that affects its result
-    target: str = ""  #: of an input to be read: the path of its sorted copy
+    #: files of the writers; None where its results go into outputs of other jobs
+    outputs: list[str] | None = field(default=None, kw_only=True)
+    needs: list[Job] = field(default_factory=list, kw_only=True)  #: jobs before: tiles of an output
+    digest: str = field(default="", kw_only=True)  #: of everything that affects its result
     #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier
     #: run) or ``failed``.
-    state: str = "waiting"
-    #: The result of its task, as saved in the work folder: counts, messages, outputs, cost,
-    #: fingerprint.
-    record: JsonObject = field(default_factory=dict)
-    reason: str = ""  #: why it failed
-    blocked: bool = False  #: an unreadable input is the reason
-
-    @property
-    def is_output(self) -> bool:
-        """Return whether it is an output that is assembled from tiles."""
-        return self.source is not None and self.outputs is not None
+    state: str = field(default="waiting", kw_only=True)
+    record: JobRecord | None = field(default=None, kw_only=True)  #: once it is done
+    record_type: type[JobRecord] = field(default=FilesRecord, kw_only=True)
+    cost: Cost | None = field(default=None, kw_only=True)  #: of its task
+    reason: str = field(default="", kw_only=True)  #: why it failed
+    blocked: bool = field(default=False, kw_only=True)  #: an unreadable input is the reason
 
     def fail(self, reason: str, blocked: bool = False) -> None:
         """Mark it as failed."""
@@ -77,11 +78,66 @@ class Job:
         if reason := next((job.reason for job in needed if job.reason), ""):
             self.fail(reason)
 
+    def keep(self, saved: JsonObject) -> None:
+        """Mark it as kept from an earlier run, with what that saved, unless it is damaged."""
+        self.state = "kept"
+        with contextlib.suppress(TypeError, KeyError):
+            self.record = self.record_type.from_json(saved)
+            self.cost = Cost(**{each.name: saved[each.name] for each in fields(Cost)})
+
+    def to_json(self) -> JsonObject:
+        """Return its record and what it took, as they are saved."""
+        record = {} if self.record is None else self.record.to_json()
+        return record | ({} if self.cost is None else vars(self.cost))
+
     def to_dict(self) -> JsonObject:
         """Return what a report tells of it, as of all jobs."""
         reason = {"reason": self.reason} if self.reason else {}
-        known = {k: v for k, v in self.record.items() if k not in ("fingerprint", "outputs")}
+        known = {k: v for k, v in self.to_json().items() if k != "outputs"}
         return {"state": self.state, **known, **reason}
+
+
+@dataclass
+class InputJob(Job):
+    """Read an input and sort its points."""
+
+    source: InputSource = field(kw_only=True)
+    record: CloudIndex | None = field(default=None, kw_only=True)
+    record_type: type[CloudIndex] = field(default=CloudIndex, kw_only=True)
+
+
+@dataclass
+class TileJob(Job):
+    """Run a round on a tile, or on a square of tiles."""
+
+    tile: tuple[int, int] = (0, 0)  #: column and row
+    record: TileRecord | None = field(default=None, kw_only=True)
+    record_type: type[TileRecord] = field(default=TileRecord, kw_only=True)
+
+    @property
+    def is_short(self) -> bool:
+        """Return whether its halo was too narrow, and could not be widened."""
+        return self.record is not None and self.record.short
+
+
+@dataclass
+class BlockJob(Job):
+    """Compute a block of the raster of a far-reaching stage."""
+
+    block: tuple[int, int] = (0, 0)  #: column and row
+
+
+@dataclass
+class OutputJob(Job):
+    """Assemble an output from tiles."""
+
+    source: InputSource = field(kw_only=True)  #: the input that it is of
+    record: OutputRecord | None = field(default=None, kw_only=True)
+    record_type: type[OutputRecord] = field(default=OutputRecord, kw_only=True)
+
+
+#: A job that may write outputs.
+WritingJob = TileJob | OutputJob
 
 
 class InterruptedRun(KeyboardInterrupt):
@@ -96,8 +152,8 @@ class InterruptedRun(KeyboardInterrupt):
 class TiledRun:
     """The result of a run."""
 
-    tiles: list[Job]
-    outputs: list[Job]  #: empty where each tile is an output
+    tiles: list[TileJob]
+    outputs: list[OutputJob]  #: empty where each tile is an output
     unreadable: dict[str, str]  #: unreadable inputs, and why
     changed: list[str]  #: files that changed during the run
     messages: list[str]  #: what the user should know
@@ -108,7 +164,7 @@ class TiledRun:
     @property
     def failures(self) -> list[tuple[str, str]]:
         """Return what failed, and why: inputs, then tiles and outputs with other reasons."""
-        jobs = [(f"tile {job.name}", job) for job in self.tiles]
+        jobs: list[tuple[str, Job]] = [(f"tile {job.name}", job) for job in self.tiles]
         jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
         return [
             *((p, why.removeprefix(f"{p}: ") + _BLOCKS) for p, why in self.unreadable.items()),
@@ -130,30 +186,38 @@ class TiledRun:
                 for job in self.tiles
             ],
             "outputs": [
-                {"input": job.source and job.source.path, "output": job.outputs} | job.to_dict()
+                {"input": job.source.path, "output": job.outputs} | job.to_dict()
                 for job in self.outputs
             ],
         }
 
 
+def _records_of(jobs: Iterable[TileJob]) -> list[TileRecord]:
+    """Return the records of the jobs that have one."""
+    return [job.record for job in jobs if job.record is not None]
+
+
+def _done(tiles: Iterable[TileJob]) -> list[TileJob]:
+    """Return the tiles that this run has done."""
+    return [job for job in tiles if job.state == "done"]
+
+
 def summarize(
-    tiles: list[Job], squares: list[Job], cpu_seconds: float, seconds: float
+    tiles: list[TileJob], squares: list[TileJob], cpu_seconds: float, seconds: float
 ) -> JsonObject:
     """Return the figures of all tiles and squares of rounds, for :attr:`TiledRun.summary`."""
-    worked = [job.record for job in tiles if job.state == "done"]
+    worked = _records_of(_done(tiles))
     classes: Counter[str] = Counter()
     point_counts: Counter[str] = Counter()
-    for job in tiles:
-        classes.update(job.record.get("classes") or {})
-    for job in [*tiles, *squares]:
-        point_counts.update(job.record.get("point_counts") or {})
-    points, read, dropped = (
-        sum(record.get(key, 0) for record in worked) for key in ("points", "read", "dropped")
-    )
+    for record in _records_of(tiles):
+        classes.update(record.classes)
+    for record in _records_of([*tiles, *squares]):
+        point_counts.update(record.point_counts)
+    points = sum(record.points for record in worked)
     return {
         "points": points,
-        "points_read": read,
-        "dropped": dropped,
+        "points_read": sum(record.read for record in worked),
+        "dropped": sum(record.dropped for record in worked),
         "seconds": seconds,
         "points_per_second": points / seconds if seconds else 0.0,
         "cpu_seconds": cpu_seconds,
@@ -164,13 +228,13 @@ def summarize(
 
 
 def messages_of(
-    tiles: list[Job], squares: list[Job], before: list[list[str]], most_points: int
+    tiles: list[TileJob], squares: list[TileJob], before: list[Sequence[str]], most_points: int
 ) -> list[str]:
     """Return warnings and notes of tiles and earlier rounds, once each, frequent ones first."""
-    done = [job for job in tiles if job.state == "done"]
+    done = _records_of(_done(tiles))
     counts: Counter[str] = Counter()
-    for lines in ([j.record.get("messages", []) for j in done if j.record.get("points")], before):
-        for text, n in Counter(text for each in lines for text in set(each)).items():
+    for lines in ([record.messages for record in done if record.points], before):
+        for text, n in Counter(text for each in lines for text in dict.fromkeys(each)).items():
             if not text.startswith((NO_POINT_MATCHES, NO_POLYGON_NEAR)):
                 counts[text] += n
             elif n == len(lines):  # that there is nothing to do in some tiles is normal
@@ -181,7 +245,7 @@ def messages_of(
     messages = [f"{text} ({count_of(n, 'tile')})" for text, n in counts.most_common(_MOST_MESSAGES)]
     if len(counts) > _MOST_MESSAGES:
         messages.append(f"and {len(counts) - _MOST_MESSAGES} more; see --report")
-    if short := [job.name for job in [*done, *squares] if job.record.get("short")]:
+    if short := [job.name for job in [*_done(tiles), *squares] if job.is_short]:
         messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
             "or terrain reach farther "
@@ -191,12 +255,11 @@ def messages_of(
     return messages + _shared_points(done)
 
 
-def _shared_points(tiles: Sequence[Job]) -> list[str]:
+def _shared_points(tiles: Sequence[TileRecord]) -> list[str]:
     """Return a message about the pair of inputs that share most points, if any do."""
     pairs: Counter[tuple[str, str]] = Counter()
-    for job in tiles:
-        for path, other, count in job.record.get("shared", []):
-            pairs[path, other] += count
+    for shared in (shared for record in tiles for shared in record.shared):
+        pairs[shared.path, shared.other] += shared.points
     more = f" (so do {len(pairs) - 1:,} more pairs of files)" if len(pairs) > 1 else ""
     return [
         f"{first} and {other} both hold {count_of(count, 'point')} at the same place and time"
@@ -209,10 +272,6 @@ def _shared_points(tiles: Sequence[Job]) -> list[str]:
 
 #: The folder beside the outputs.
 FOLDER = ".pdal-stages"
-
-
-#: How the files of arrays end, which tiles leave for outputs.
-_ARRAYS = ".npz"
 
 
 class Store:
@@ -271,15 +330,12 @@ class Store:
 
     def path(self, name: str) -> str:
         """Return the path of a file of arrays."""
-        return str(self.kept / f"{name}{_ARRAYS}")
+        return str(self.kept / f"{name}{ARRAYS}")
 
-    def finish(self, name: str, digest: str, record: JsonObject) -> None:
-        """Save the record of a finished job.
-
-        `digest` is the fingerprint of everything that affects it.
-        """
+    def finish(self, name: str, content: JsonObject, digest: str = "") -> None:
+        """Save what a job that is done tells of itself, and the digest of all that affects it."""
         partial = self.kept / f"{name}.partial"
-        partial.write_text(json.dumps({**record, "fingerprint": digest}))
+        partial.write_text(json.dumps({**content, "fingerprint": digest}))
         os.replace(partial, self._note(name))
 
     def forget(self, name: str) -> None:
@@ -294,33 +350,38 @@ class Store:
         except (OSError, ValueError, RecursionError):
             return {}
 
+    def grids(self) -> RunGrids | None:
+        """Return the grids of the run before; None where it is not known."""
+        with contextlib.suppress(TypeError):
+            return RunGrids.from_json(self.note("run"))
+        return None
+
     def finished(self, name: str, digest: str) -> JsonObject | None:
         """Return the record of a job if `digest` matches and the files it wrote are unchanged."""
         record = self.note(name)
         with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
-            files = record.get("outputs", [])
-            if record.get("fingerprint") == digest and all(map(_is_as_written, files)):
+            unchanged = all(file.is_as_written for file in written_files(record))
+            if record.get("fingerprint") == digest and unchanged:
                 return record
         return None
 
     def edited(self, name: str) -> list[str]:
         """Return the outputs of a finished job that were changed since it wrote them."""
         paths = []
-        for entry in self.note(name).get("outputs", []):
-            with contextlib.suppress(OSError, ValueError, TypeError):
-                if len(entry) == _ENTRY and entry[3] and not _is_as_written(entry):
-                    paths.append(str(entry[0]))
+        with contextlib.suppress(TypeError):
+            for file in written_files(self.note(name)):
+                with contextlib.suppress(OSError, ValueError, TypeError):
+                    if file.digest and not file.is_as_written:
+                        paths.append(str(file.path))
         return paths
 
     def left_over(self, outputs: Collection[str]) -> list[str]:
         """Return the outputs of earlier runs that are still there, but not among `outputs`."""
         paths: set[str] = set()
         for note in self.kept.glob("*.json"):
-            with contextlib.suppress(TypeError, AttributeError, IndexError):
-                entries = self.note(note.stem).get("outputs", [])
-                paths.update(
-                    str(entry[0]) for entry in entries if len(entry) == _ENTRY and entry[3]
-                )
+            with contextlib.suppress(TypeError):
+                files = written_files(self.note(note.stem))
+                paths.update(str(file.path) for file in files if file.digest)
         return sorted(path for path in paths - {*outputs} if os.path.exists(path))
 
     def _note(self, name: str) -> Path:
@@ -331,35 +392,6 @@ class Store:
         for path in self.kept.glob(f"*{ending}"):
             if path.name not in but:
                 path.unlink(missing_ok=True)
-
-
-#: Values of a file in a record: its name, size, time, and digest.
-_ENTRY = 4
-
-
-def written(outputs: Sequence[str | os.PathLike]) -> list[list[Any]]:
-    """Return names, sizes, times and digests of files just written, for a record.
-
-    The run's own arrays, which nobody edits, have an empty digest.
-    """
-    entries = []
-    for path in map(str, outputs):
-        status = os.stat(path)
-        digest = "" if path.endswith(_ARRAYS) else digest_of_file(path)
-        entries.append([path, status.st_size, status.st_mtime_ns, digest])
-    return entries
-
-
-def _is_as_written(entry: Sequence[Any]) -> bool:
-    """Return whether a file of a record holds what was written; OSError where it is gone.
-
-    It is read only where its size or time differ, as after it was copied.
-    """
-    path, size, time_ns, digest = entry
-    status = os.stat(path)
-    if [status.st_size, status.st_mtime_ns] == [size, time_ns]:
-        return True
-    return bool(digest) and digest_of_file(path) == digest
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, NDArray]) -> None:

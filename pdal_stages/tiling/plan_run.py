@@ -15,7 +15,7 @@ from ..pipeline.spatial_reference import NO_REFERENCE
 from ..pipeline.workers import Workers
 from ..stages.points import METERS_ASSUMED
 from .inputs import Survey
-from .jobs import Job, Store, TiledRun, messages_of, summarize
+from .jobs import OutputJob, Store, TiledRun, TileJob, WritingJob, messages_of, summarize
 from .plan import RunContext, TilePlan, outputs_for
 from .run_tile import run_tile
 from .survey_run import SurveyRun
@@ -30,10 +30,11 @@ class PlanRun(SurveyRun):
     ) -> None:
         super().__init__(survey, store, workers, show)
         self.plan = plan
-        self.tiles: list[Job] = []  #: with points of their own, row by row
-        self.squares: list[Job] = []  #: of the rounds before the last
-        self.outputs: list[Job] = []  #: one for each input file; empty where each tile is an output
-        self.messages_before: list[list[str]] = []  #: of the rounds before the last
+        self.tiles: list[TileJob] = []  #: with points of their own, row by row
+        self.squares: list[TileJob] = []  #: of the rounds before the last
+        #: one for each input file; empty where each tile is an output
+        self.outputs: list[OutputJob] = []
+        self.messages_before: list[Sequence[str]] = []  #: of the rounds before the last
         #: How far around a tile, in units of the coordinates, inputs are available: its halo may
         #: have to grow (four halos are room for that, not tuned).
         halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
@@ -83,7 +84,7 @@ class PlanRun(SurveyRun):
             writing if per_tile else [],
         )
         for tile, points in survey.tiles().items():
-            job = Job(grid.name(tile), points, tile)
+            job = TileJob(grid.name(tile), points, tile)
             near = survey.near(tile, max(sees, self.farthest))
             job.digest = fingerprint(common, tile, [source.content for source in near])
             if bad := [source.path for source in survey.near(tile, sees) if source.fault]:
@@ -97,21 +98,21 @@ class PlanRun(SurveyRun):
             return
         by_tile = {job.tile: job for job in self.tiles}
         for source, paths in zip(survey.sources, survey.outputs, strict=True):
-            out = Job(f"file-{source.key}", source=source, outputs=paths)
+            out = OutputJob(f"file-{source.key}", source=source, outputs=paths)
             if index := source.index:
-                out.points, out.jobs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
-            out.digest = fingerprint(
-                source.content, writing, [job.digest for job in out.jobs], paths
-            )
+                out.points, out.needs = index.count, [by_tile[i, j] for i, j, _ in index.tiles]
+            digests = [job.digest for job in out.needs]
+            out.digest = fingerprint(source.content, writing, digests, paths)
             if source.fault:
                 out.fail(f"its input cannot be read: {source.path}", blocked=True)
             self.outputs.append(out)
 
     def take_over(self) -> None:
         """Keep the results of an earlier run; tiles that no output needs are not run again."""
-        needed = {job.name for out in self.unkept(self.outputs) for job in out.jobs}
+        needed = {job.name for out in self.unkept(self.outputs) for job in out.needs}
         self.unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
-        outputs = {path for job in (*self.tiles, *self.outputs) for path in job.outputs or ()}
+        jobs: list[WritingJob] = [*self.tiles, *self.outputs]
+        outputs = {path for job in jobs for path in job.outputs or ()}
         self.survey.messages += [
             *_name_outputs(
                 "outputs edited since they were written are kept (--overwrite replaces them)",
@@ -125,10 +126,7 @@ class PlanRun(SurveyRun):
         for job in self.tiles:
             if job.state == "waiting" and job.outputs is None and job.name not in needed:
                 known = self.store.note(job.name)
-                job.state, job.record = (
-                    "kept",
-                    known if known.get("fingerprint") == job.digest else {},
-                )
+                job.keep(known if known.get("fingerprint") == job.digest else {})
 
     @cached_property
     def context(self) -> RunContext:
@@ -150,35 +148,35 @@ class PlanRun(SurveyRun):
             kept=str(self.store.kept),
         )
 
-    def make_outputs(self, finished: Callable[[Job], None] | None = None) -> None:
+    def make_outputs(self, finished: Callable[[WritingJob], None] | None = None) -> None:
         """Run all waiting tiles, and outputs as soon as their last tile is done.
 
         `finished` is called with outputs.
         """
         context, store = self.context, self.store
-        waiting = deque(job for job in self.tiles if job.state == "waiting")
-        users: dict[str, list[Job]] = {}
+        waiting = deque[WritingJob](job for job in self.tiles if job.state == "waiting")
+        users: dict[str, list[OutputJob]] = {}
         for out in self.outputs:
             _make_ready(out, waiting)
-            for job in out.jobs:
+            for job in out.needs:
                 users.setdefault(job.name, []).append(out)
 
-        def task_of(job: Job) -> Callable[[], Any]:
-            if job.source is None:
+        def task_of(job: WritingJob) -> Callable[[], Any]:
+            if isinstance(job, TileJob):
                 return self.tile_task(len(self.plan.rounds) - 1, job)
-            results = [store.path(each.name) for each in job.jobs]
             assert job.outputs is not None
+            results = [store.path(each.name) for each in job.needs]
             plan, scratch = context.plan, context.scratch
             return partial(write_file, plan, job.source, results, job.outputs, scratch)
 
         for job in self.do("tiles", waiting, task_of):
-            written = job.state == "done" and job.outputs and job.record["outputs"]
-            if finished is not None and written:
+            has_written = job.record is not None and job.record.written is not None
+            if finished is not None and has_written:
                 finished(job)
             for out in users.get(job.name, ()):
                 _make_ready(out, waiting)
 
-    def tile_task(self, number: int, job: Job) -> Callable[[], Any]:
+    def tile_task(self, number: int, job: TileJob) -> Callable[[], Any]:
         """Return the task that runs a round on a tile or square."""
         survey = self.survey
         box = self.context.grid_of(number).box(job.tile, self.farthest)
@@ -193,7 +191,7 @@ class PlanRun(SurveyRun):
     def forget(self) -> None:
         """Remove files that no job needs any more."""
         needed = {
-            f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.jobs
+            f"{job.name}.npz" for out in self.outputs if out.state == "failed" for job in out.needs
         }
         if any(job.state == "failed" for job in self.tiles):
             for pattern in ("*.block.npz", "*.round*.npz"):
@@ -207,11 +205,11 @@ def _name_outputs(what: str, paths: Sequence[str]) -> list[str]:
     return [f"{what}: {', '.join(paths[:3])}{more}"] if paths else []
 
 
-def _make_ready(out: Job, waiting: deque[Job]) -> None:
+def _make_ready(out: OutputJob, waiting: deque[WritingJob]) -> None:
     """Queue an output when its last tile is done."""
-    if out.state != "waiting" or any(job.state == "waiting" for job in out.jobs):
+    if out.state != "waiting" or any(job.state == "waiting" for job in out.needs):
         return
-    failed = [job for job in out.jobs if job.state == "failed"]
+    failed = [job for job in out.needs if job.state == "failed"]
     if failed:
         others = f", and {len(failed) - 1} more of its tiles" if len(failed) > 1 else ""
         blocked = all(job.blocked for job in failed)

@@ -10,7 +10,7 @@ from typing import Any
 from ..base.hashing import fingerprint
 from ..base.version import build
 from .earlier_rounds import block_name, blocks_near, make_block, square_name
-from .jobs import Job
+from .jobs import BlockJob, TileJob
 from .options import Box, TileGrid
 from .plan_run import PlanRun
 from .survey_run import stop_if_hopeless
@@ -29,24 +29,24 @@ class RoundJobs:
         """
         waiting = [job for job in self.run.tiles if job.state == "waiting"]
         users = waiting
-        layers: list[tuple[list[Job], list[Job]]] = []
+        layers: list[tuple[list[TileJob], list[BlockJob]]] = []
         for number in reversed(range(len(self.run.plan.rounds) - 1)):
             layers.insert(0, self._layer(number, users))
             users = layers[0][0]
         for number, (squares, blocks) in enumerate(layers):
             for job in squares:
-                job.fail_with(job.jobs)
+                job.fail_with(job.needs)
             label = f"round {number + 1}"
             task_of = partial(self.run.tile_task, number)
             for job in self.run.do(label, self.run.unkept(squares), task_of):
-                self.run.messages_before.append(job.record.get("messages", []))
-            for job in blocks:
-                job.fail_with(job.jobs)
+                self.run.messages_before.append(job.record.messages if job.record else [])
+            for block in blocks:
+                block.fail_with(block.needs)
             for _ in self.run.do(f"{label}, blocks", self.run.unkept(blocks), self._block_task):
                 pass
             self.run.squares += squares
         for job in waiting:
-            job.fail_with(job.jobs)
+            job.fail_with(job.needs)
         stop_if_hopeless([job.reason for job in waiting])
 
     @cached_property
@@ -58,8 +58,8 @@ class RoundJobs:
             points[job.tile[0] // factor, job.tile[1] // factor] += job.points
         return points
 
-    def _layer(self, number: int, users: list[Job]) -> tuple[list[Job], list[Job]]:
-        """Return jobs for the squares of a round, and for blocks, that `users` need (their jobs).
+    def _layer(self, number: int, users: list[TileJob]) -> tuple[list[TileJob], list[BlockJob]]:
+        """Return jobs for the squares of a round, and for blocks, that `users` need.
 
         What an earlier run with other inputs left is removed.
         """
@@ -67,10 +67,10 @@ class RoundJobs:
         grid, every, unit = context.grid_of(number + 1), self._points_of_squares, survey.unit
         names = {square: f"{square_name(context, number, square)}.npz" for square in every}
         self.run.store.remove(f".round{number}.npz", names.values())
-        squares: dict[tuple[int, int], Job] = {}
-        blocks: dict[tuple[int, int], Job] = {}
+        squares: dict[tuple[int, int], TileJob] = {}
+        blocks: dict[tuple[int, int], BlockJob] = {}
 
-        def squares_in(box: Box) -> list[Job]:
+        def squares_in(box: Box) -> list[TileJob]:
             places = sorted(every.keys() & survey.squares.covering(box))
             for place in places:
                 squares[place] = squares.get(place) or self._square_job(number, place)
@@ -79,7 +79,7 @@ class RoundJobs:
         far = self.run.farthest if self.run.plan.rounds[number + 1].halo_m else 0.0
         for job in users:
             box = grid.box(job.tile, far)
-            job.jobs = squares_in(box) if part.saved else []
+            job.needs = [*squares_in(box)] if part.saved else []
         if part.blocks is None:
             return list(squares.values()), []
         boxes = [survey.grid.box(job.tile) for job in self.run.tiles]
@@ -95,11 +95,13 @@ class RoundJobs:
                     x0, y0, x1, y1 = (side / unit for side in box_m)
                     needed = squares_in((x0, y0, x1, y1))
                     digest = fingerprint(place, part.blocks, [each.digest for each in needed])
-                    blocks[place] = Job(block_name(place), 1, place, jobs=needed, digest=digest)
-                job.jobs.append(blocks[place])
+                    blocks[place] = BlockJob(
+                        block_name(place), 1, place, needs=[*needed], digest=digest
+                    )
+                job.needs.append(blocks[place])
         return list(squares.values()), list(blocks.values())
 
-    def _square_job(self, number: int, square: tuple[int, int]) -> Job:
+    def _square_job(self, number: int, square: tuple[int, int]) -> TileJob:
         """Return the job of a square; its digest tells of all inputs that may matter."""
         survey, part = self.run.survey, self.run.plan.rounds[number]
         stages = self.run.plan.in_tiles[: part.end + (part.blocks is not None)]
@@ -107,15 +109,15 @@ class RoundJobs:
         box = survey.squares.box(square, far)
         digest = fingerprint(
             [build(), stages, survey.stamps_of(self.run.plan.files[: len(stages)])],
-            [survey.layout, survey.unit, vars(part), square],
+            [vars(survey.grids), survey.unit, vars(part), square],
             [source.content for source in survey.near_box(box) if not source.fault],
         )
         name = square_name(self.run.context, number, square)
-        return Job(name, self._points_of_squares[square], square, digest=digest)
+        return TileJob(name, self._points_of_squares[square], square, digest=digest)
 
-    def _block_task(self, job: Job) -> Callable[[], Any]:
+    def _block_task(self, job: BlockJob) -> Callable[[], Any]:
         """Return the task that computes a block."""
-        squares = [self.run.store.path(each.name) for each in job.jobs]
+        squares = [self.run.store.path(each.name) for each in job.needs]
         return partial(
-            make_block, self.run.context, job.tile, squares, self.run.store.path(job.name)
+            make_block, self.run.context, job.block, squares, self.run.store.path(job.name)
         )

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +32,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.columns import SomeRows
 from ..base.distinct import count_shared
 from ..base.errors import NoTerrainError, PipelineError
-from ..base.json_types import JsonObject, StageJson
+from ..base.json_types import StageJson
 from ..base.las_copy import LasCopy
 from ..base.las_points import LasColumns
 from ..base.messages import shorten
@@ -53,9 +53,10 @@ from .earlier_rounds import (
     with_threads,
 )
 from .inputs import InputSource
-from .jobs import save_arrays, written
+from .jobs import save_arrays
 from .options import Box, inside
 from .plan import INPUT, OUTSIDE, ROW, RunContext
+from .records import SharedPoints, TileRecord, WrittenFile, describe_written
 from .sorted_points import Piece, cut_all
 from .write_outputs import PieceResults, arrays_of, write_tile
 
@@ -350,22 +351,6 @@ class _TileHalo:
         return not self.short
 
 
-@dataclass
-class TileRecord:
-    """The record of a tile that ran."""
-
-    points: int  #: of the tile
-    read: int  #: with its halo
-    halo_m: float  #: that was used
-    short: bool  #: whether that was too narrow
-    widened: bool  #: whether it is wider than planned
-    dropped: int  #: points that stages removed
-    classes: dict[str, int]  #: points by class code
-    messages: Sequence[str]
-    point_counts: Mapping[str, int]  #: by ``type.name``
-    shared: list[tuple[str, str, int]]  #: pairs of inputs, and their points at one place and time
-
-
 # ---- the task of a worker ------------------------------------------------------------------------
 
 
@@ -377,7 +362,7 @@ def run_tile(
     complete_m: float,
     target: str,
     outputs: list[str] | None = None,
-) -> JsonObject:
+) -> TileRecord:
     """Run a round on a tile, or on a larger square; save the results or write the outputs.
 
     Parameters
@@ -394,11 +379,6 @@ def run_tile(
         The file for the results, where tiles are not outputs.
     outputs : list of str, optional
         The files of the writers, where tiles are outputs.
-
-    Returns
-    -------
-    dict
-        The :class:`TileRecord`, and what was written.
     """
     halo = _TileHalo(context, number, tile, complete_m, context.plan.rounds[number].halo_m)
     with TemporaryDirectory(dir=context.scratch, ignore_cleanup_errors=True) as folder:
@@ -415,12 +395,12 @@ def run_tile(
                 found=f"within {halo.used_m:.0f} m",
                 cure="Take larger tiles, or run without --tile; given ground must lie near each",
             )
-        record = vars(_describe(halo, pieces, result))
+        record = _describe(halo, pieces, result)
         if outputs is None:
-            return record | _save(halo, result, target)
+            return replace(record, outputs=_save(halo, result, target))
         output = write_tile(result.results, context.plan, outputs, context.scratch)
-        messages = [*record["messages"], *output.get("messages", [])]
-        return record | output | {"messages": messages}
+        classes = record.classes if output.classes is None else output.classes
+        return replace(record, outputs=output.outputs, written=output.written, classes=classes)
 
 
 def _read(halo: _TileHalo, sources: Sequence[InputSource]) -> list[Piece]:
@@ -471,16 +451,17 @@ def _describe(halo: _TileHalo, pieces: list[Piece], result: RoundResult) -> Tile
     )
 
 
-def _shared(pieces: Sequence[Piece]) -> list[tuple[str, str, int]]:
+def _shared(pieces: Sequence[Piece]) -> list[SharedPoints]:
     """Return the pairs of inputs that hold the same points in a tile, and how many."""
     parts = [(piece, piece.records[piece.own_rows]) for piece in pieces if len(piece.own_rows)]
     columns = [LasColumns([(piece.layout, records)]) for piece, records in parts]
     paths = [piece.source.path for piece, _ in parts]
-    return [(paths[a], paths[b], count) for (a, b), count in count_shared(columns).items()]
+    pairs = count_shared(columns).items()
+    return [SharedPoints(paths[a], paths[b], count) for (a, b), count in pairs]
 
 
-def _save(halo: _TileHalo, result: RoundResult, target: str) -> JsonObject:
-    """Save what the next round, or an output, needs; return the file in a record."""
+def _save(halo: _TileHalo, result: RoundResult, target: str) -> list[WrittenFile]:
+    """Save what the next round, or an output, needs; return the file."""
     plan = halo.context.plan
     part, arrays = plan.rounds[halo.number], arrays_of(result.results)
     if halo.number + 1 < len(plan.rounds) and not part.saved:
@@ -488,4 +469,4 @@ def _save(halo: _TileHalo, result: RoundResult, target: str) -> JsonObject:
     if part.blocks is not None:
         arrays |= _concatenate_by_name([{"around": np.empty((0, 3))}, *result.reduced])
     save_arrays(target, arrays)
-    return {"outputs": written([target])}
+    return describe_written([target])

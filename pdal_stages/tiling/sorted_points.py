@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from ..base.files import whole_files
 from ..base.grid import begins_run
 from ..base.hashing import digest_of_file
-from ..base.json_types import JsonObject
 from ..base.las_points import Layout, read_records
 from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource, sum_points
@@ -42,10 +41,10 @@ def _copy_type(layout: Layout) -> np.dtype:
     return np.dtype([("number", "<i8"), ("record", layout.dtype)])
 
 
-def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> JsonObject:
-    """Read a file once, write its points into a sorted copy, and return their index as a record.
+def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> CloudIndex:
+    """Read a file once, write its points into a sorted copy, and return their index.
 
-    :class:`CloudIndex` parses it. `lone_grid` is :attr:`.Survey.lone_grid`.
+    `lone_grid` is :attr:`.Survey.lone_grid`.
     """
     layout = Layout.of_file(path)
     dtype, cells = _copy_type(layout), grid.scaled(1 / _CELLS)
@@ -77,12 +76,9 @@ def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> 
         check_number(len(tiles), f"{path}, tiles of {grid.size:g}")
     squares = sum_points(np.concatenate(held_squares))
     refuse_scattered(squares[:, 2].tolist())
-    box = [*low.tolist(), *high.tolist()]
-    return {
-        **{"count": total, "box": box, "tiles": tiles.tolist(), "cells": held.tolist()},
-        **{"grid": [cells.size, cells.origin], "changed_ns": changed_ns, "digest": digest},
-        "squares": squares.tolist(),
-    }
+    box = (*low.tolist(), *high.tolist())
+    places = [(i, j, n) for i, j, n in tiles.tolist()]
+    return CloudIndex(total, box, places, held, cells, digest, changed_ns, squares, target)
 
 
 def _runs(

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from ..base import las_check
 from ..base.errors import StageError
@@ -15,10 +15,11 @@ from ..base.hashing import fingerprint
 from ..base.progress import Progress
 from ..pipeline.workers import ThisProcess, WorkerProcesses, Workers, run_tasks
 from .inputs import CloudIndex, Survey
-from .jobs import Job, Store
+from .jobs import InputJob, Job, OutputJob, Store
 from .options import TilingOptions
 from .sorted_points import TEMPORARY, sort_points
 
+_Job = TypeVar("_Job", bound=Job)
 #: A run stops when this many tiles failed for the same reason and none succeeded (not tuned).
 _HOPELESS = 10
 
@@ -44,8 +45,8 @@ class SurveyRun:
         self.peak_mb = 0.0  #: peak memory of a process
 
     def do(
-        self, what: str, waiting: deque[Job], task_of: Callable[[Job], Callable[[], Any]]
-    ) -> Iterator[Job]:
+        self, what: str, waiting: deque[_Job], task_of: Callable[[_Job], Callable[[], Any]]
+    ) -> Iterator[_Job]:
         """Run jobs as workers become free, save their records, and yield each.
 
         Outputs may be added after every one. StageError where the first ones all fail for the same
@@ -53,19 +54,19 @@ class SurveyRun:
         """
         for job in waiting:
             self.store.forget(job.name)
-        counted = [job for job in waiting if not job.is_output]
+        counted = [job for job in waiting if not isinstance(job, OutputJob)]
         done, failures = 0, []
         with Progress(sum(job.points for job in counted), what, enabled=self.show) as progress:
             for job, answer in run_tasks(self.workers, waiting, task_of):
-                self.cpu_seconds += answer.cost.get("cpu_seconds", 0.0)
-                self.peak_mb = max(self.peak_mb, answer.cost.get("peak_mb", 0.0))
+                self.cpu_seconds += answer.cost.cpu_seconds
+                self.peak_mb = max(self.peak_mb, answer.cost.peak_mb)
                 if answer.reason:
                     job.fail(answer.reason)
                 else:
-                    job.state, job.record = "done", answer.result | answer.cost
+                    job.state, job.record, job.cost = "done", answer.result, answer.cost
                     with contextlib.suppress(OSError):  # no room: a later run does it again
-                        self.store.finish(job.name, job.digest, job.record)
-                if not job.is_output:
+                        self.store.finish(job.name, job.to_json(), job.digest)
+                if not isinstance(job, OutputJob):
                     done += not answer.reason
                     failures += [answer.reason] if answer.reason else []
                     failed = f", {len(failures)} failed" if failures else ""
@@ -84,49 +85,42 @@ class SurveyRun:
         `needed` (paths).
         """
         survey, store = self.survey, self.store
-        waiting: deque[Job] = deque()
+        waiting: deque[InputJob] = deque()
         for source in survey.readable():
             if source.index and (source.index.copy or source.path not in needed):
                 continue
             name = fingerprint(source.path, vars(survey.grid))
             # Without a valid record it is read again.
             with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
-                index = CloudIndex.parse(store.note(name))
+                index = CloudIndex.from_json(store.note(name))
                 if source.path not in needed and index.is_of(source.path):
                     source.index = index
                     continue
             assert source.extent is not None
-            waiting.append(Job(name, source.extent.count, source=source))
+            waiting.append(InputJob(name, source.extent.count, source=source))
 
-        def copy_of(job: Job) -> str:
-            return str(store.scratch / f"{job.name}.points")
-
-        def task_of(job: Job) -> Callable[[], Any]:
-            assert job.source is not None
-            grids = survey.grid, survey.lone_grid
-            return partial(sort_points, job.source.path, *grids, copy_of(job))
+        def task_of(job: InputJob) -> Callable[[], Any]:
+            copy = str(store.scratch / f"{job.name}.points")
+            return partial(sort_points, job.source.path, survey.grid, survey.lone_grid, copy)
 
         for job in self.do("reading the inputs", waiting, task_of):
-            assert job.source is not None
             if f"the {TEMPORARY} file" in job.reason:  # the input is not the cause
                 raise StageError(job.reason)
             job.source.fault = job.reason
-            if not job.reason:
-                job.source.index = index = CloudIndex.parse(job.record, copy_of(job))
-                if index.count:
-                    survey.messages += filter(
-                        None, [las_check.beyond_box(job.source.path, index.box)]
-                    )
+            job.source.index = job.record or job.source.index
+            if job.record is not None and job.record.count:
+                odd = las_check.beyond_box(job.source.path, job.record.box)
+                survey.messages += [odd] if odd else []
         survey.place()
 
-    def unkept(self, jobs: Iterable[Job]) -> deque[Job]:
+    def unkept(self, jobs: Iterable[_Job]) -> deque[_Job]:
         """Return the waiting jobs that no earlier run has finished."""
         waiting = deque(job for job in jobs if job.state == "waiting")
         for job in waiting:
             if known := self.store.finished(job.name, job.digest):
-                job.state, job.record = "kept", known
+                job.keep(known)
             elif not self.survey.options.overwrite and (paths := self.store.edited(job.name)):
-                job.state, job.record = "kept", self.store.note(job.name)
+                job.keep(self.store.note(job.name))
                 self.edited += paths
         return deque(job for job in waiting if job.state == "waiting")
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,24 +30,62 @@ from .inputs import LONE_M, InputSource, LonePoints, Survey
 from .jobs import Job, Store, load_arrays, save_arrays
 from .options import Density, TileGrid, TilingOptions
 from .plan import TilePlan
+from .records import JobRecord
 from .rounds import Round
 from .sorted_points import points_near
 from .survey_run import SurveyRun, workers_of
 
 #: Points of an input: its path, and their dimensions by PDAL's names.
 Part = tuple[str, Mapping[str, NDArray]]
-#: Reduces the points of a tile, those of each input that has any there, to arrays and figures that
-#: JSON can hold. Lone points are to be left out of the arrays.
-Reduce = Callable[[list[Part], LonePoints], tuple[dict[str, NDArray], JsonObject]]
 #: Column and row of a tile.
 Tile = tuple[int, int]
-#: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
-#: writes it to a file, and returns figures.
-Compute = Callable[[Tile, dict[Tile, str], str], Callable[[], Any]]
 #: Returns the density by which tiles are chosen, from that of points and meters per unit.
 Measure = Callable[[Density, float], Density]
 #: Reasons that are shown where tiles fail.
 _MOST_REASONS = 3
+
+
+class LonePoint(NamedTuple):
+    """A point that is left out, as it is alone."""
+
+    path: str  #: of its input
+    x: float
+    y: float
+
+
+@dataclass
+class Reduced(JobRecord):
+    """Figures of a tile that was reduced; subclasses add theirs."""
+
+    lone: list[LonePoint] = field(default_factory=list, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Take points as JSON holds them, too."""
+        self.lone = [LonePoint(*each) for each in self.lone]
+
+
+_Figures = TypeVar("_Figures", bound=JobRecord)
+_Reduced = TypeVar("_Reduced", bound=Reduced)
+#: Reduces the points of a tile, those of each input that has any there, to arrays and figures. Lone
+#: points are to be left out of the arrays.
+Reduce = Callable[[list[Part], LonePoints], tuple[dict[str, NDArray], _Reduced]]
+#: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
+#: writes it to a file, and returns figures.
+Compute = Callable[[Tile, dict[Tile, str], str], Callable[[], _Figures]]
+
+
+@dataclass
+class RecordJob(Job, Generic[_Figures]):
+    """Reduce a tile, or compute a result of it, with figures."""
+
+    tile: Tile = field(kw_only=True)
+    record: _Figures | None = field(default=None, kw_only=True)
+
+    @property
+    def figures(self) -> _Figures:
+        """Return the figures of a job that is done."""
+        assert self.record is not None
+        return self.record
 
 
 class RecordSurvey(Survey):
@@ -83,10 +122,8 @@ class RecordSurvey(Survey):
         )
         self.folder, self._measure = folder, measure
         self.chosen = replace(tiling or TilingOptions(), per="tile")  #: as the user gives them
-        known = {}
-        if self.chosen.resume and self.chosen.tile is None:
-            known = Store(folder).note("run")
-        super().__init__(plan, self.chosen, known if "square" in known else None)
+        resumed = self.chosen.resume and self.chosen.tile is None
+        super().__init__(plan, self.chosen, Store(folder).grids() if resumed else None)
 
     def measure_density(self) -> Density:
         """Return the density by which tiles are chosen."""
@@ -96,8 +133,10 @@ class RecordSurvey(Survey):
 class RecordRun(SurveyRun):
     """A run that reduces the tiles of a survey, and computes results from the records."""
 
-    def reduce(self, name: str, settings: JsonObject, reduce: Reduce) -> list[Job]:
-        """Reduce the points of each tile; return its jobs, whose records are the figures.
+    def reduce(
+        self, name: str, settings: JsonObject, reduce: Reduce[_Reduced], kind: type[_Reduced]
+    ) -> list[RecordJob[_Reduced]]:
+        """Reduce the points of each tile; return its jobs with the figures, which are of a kind.
 
         The arrays lie in :meth:`path_of` the job. `settings` are all that affects them beside the
         points.
@@ -109,29 +148,30 @@ class RecordRun(SurveyRun):
         lone = survey.find_lone_points()
         common = [settings, lone.keys.tolist()]
         marks = {tile: [common, [each.content for each in near[tile]]] for tile in tiles}
-        jobs = self._jobs(name, tiles, marks)
+        jobs = self._jobs(name, tiles, marks, kind)
         waiting = self._without_arrays(jobs)
         self.read_inputs({source.path for job in waiting for source in near[job.tile]})
         if faults := survey.faults:  # a result would have holes
             seen = "; ".join(f"{path}: {why}" for path, why in [*faults.items()][:_MOST_REASONS])
             raise StageError(f"{len(faults)} of the inputs cannot be read", found=seen)
 
-        def task_of(job: Job) -> Callable[[], Any]:
+        def task_of(job: RecordJob[_Reduced]) -> Callable[[], _Reduced]:
             sources = near[job.tile]
             return partial(_reduce_tile, grid, job.tile, sources, reduce, lone, self.path_of(job))
 
         self._finish("reducing tiles", waiting, task_of)
-        print_messages(*_name_lone([point for job in jobs for point in job.record["lone"]]))
+        print_messages(*_name_lone([point for job in jobs for point in job.figures.lone]))
         return jobs
 
     def compute(
         self,
         name: str,
-        reduced: Sequence[Job],
+        reduced: Sequence[RecordJob[_Reduced]],
         tiles: Iterable[Tile],
         reach: float,
-        compute: Compute,
-    ) -> list[Job]:
+        compute: Compute[_Figures],
+        kind: type[_Figures],
+    ) -> list[RecordJob[_Figures]]:
         """Compute results of tiles from the arrays of reduced ones within a reach; return the jobs.
 
         Tiles with no reduced ones around have no result. The reach is in the unit of the
@@ -139,7 +179,7 @@ class RecordRun(SurveyRun):
         """
         grid, of_tile = self.survey.grid, {job.tile: job for job in reduced}
         wide = range(-math.ceil(reach / grid.size), math.ceil(reach / grid.size) + 1)
-        near: dict[Tile, list[Job]] = {}
+        near: dict[Tile, list[RecordJob[_Reduced]]] = {}
         for i, j in tiles:
             sources = [
                 of_tile[i + k, j + l] for l in wide for k in wide if (i + k, j + l) in of_tile
@@ -147,9 +187,9 @@ class RecordRun(SurveyRun):
             near |= {(i, j): sources} if sources else {}
         marks = {tile: [job.digest for job in sources] for tile, sources in near.items()}
         points = {tile: of_tile[tile].points if tile in of_tile else 1 for tile in near}
-        jobs = self._jobs(name, points, marks)
+        jobs = self._jobs(name, points, marks, kind)
 
-        def task_of(job: Job) -> Callable[[], Any]:
+        def task_of(job: RecordJob[_Figures]) -> Callable[[], _Figures]:
             files = {each.tile: self.path_of(each) for each in near[job.tile]}
             return compute(job.tile, files, self.path_of(job))
 
@@ -164,22 +204,39 @@ class RecordRun(SurveyRun):
         """Yield arrays of jobs, those of one at a time."""
         return (load_arrays(self.path_of(job), names) for job in jobs)
 
-    def _jobs(self, name: str, points: Mapping[Tile, int], marks: Mapping[Tile, Any]) -> list[Job]:
+    def _jobs(
+        self,
+        name: str,
+        points: Mapping[Tile, int],
+        marks: Mapping[Tile, Any],
+        kind: type[_Figures],
+    ) -> list[RecordJob[_Figures]]:
         """Return jobs for tiles with their numbers of points, and with what affects each."""
         grid, common = self.survey.grid, [build(), name, vars(self.survey.grid)]
         return [
-            Job(f"{grid.name(tile)}.{name}", n, tile, digest=fingerprint(common, tile, marks[tile]))
-            for tile, n in points.items()
+            RecordJob(
+                f"{grid.name(tile)}.{name}",
+                number,
+                tile=tile,
+                digest=fingerprint(common, tile, marks[tile]),
+                record_type=kind,
+            )
+            for tile, number in points.items()
         ]
 
-    def _without_arrays(self, jobs: Sequence[Job]) -> Any:
+    def _without_arrays(self, jobs: Sequence[RecordJob[_Figures]]) -> deque[RecordJob[_Figures]]:
         """Return the jobs that no earlier run has finished, in their order."""
         for job in jobs:
             if not os.path.exists(self.path_of(job)):
                 self.store.forget(job.name)
         return self.unkept(jobs)
 
-    def _finish(self, what: str, waiting: Any, task_of: Callable[[Job], Callable[[], Any]]) -> None:
+    def _finish(
+        self,
+        what: str,
+        waiting: deque[RecordJob[_Figures]],
+        task_of: Callable[[RecordJob[_Figures]], Callable[[], _Figures]],
+    ) -> None:
         """Run jobs; StageError where one fails."""
         failed = [job.reason for job in self.do(what, waiting, task_of) if job.reason]
         if failed:
@@ -203,7 +260,7 @@ def record_run(survey: RecordSurvey, progress: bool | None = None) -> Iterator[R
     with Store(survey.folder) as store:
         if not chosen.resume:
             store.clear()
-        store.finish("run", "", survey.layout)
+        store.finish("run", survey.grids.to_json())
         with workers_of(options, str(store.folder)) as workers:
             yield RecordRun(survey, store, workers, progress)
         store.remove(".npz")
@@ -227,23 +284,22 @@ def _reduce_tile(
     grid: TileGrid,
     tile: Tile,
     sources: Sequence[InputSource],
-    reduce: Reduce,
+    reduce: Reduce[_Reduced],
     lone: LonePoints,
     target: str,
-) -> JsonObject:
+) -> _Reduced:
     """Read the points of a tile, save the arrays they are reduced to, and return the figures."""
     parts = points_of_tile(grid, tile, sources)
     arrays, figures = reduce(parts, lone)
     save_arrays(target, arrays)
-    named = []
     for path, part in parts:
         alone = lone.among(part["X"], part["Y"])
         places = np.column_stack([part["X"][alone], part["Y"][alone]])
-        named += [[path, *place] for place in places.tolist()]
-    return {**figures, "lone": named}
+        figures.lone += [LonePoint(path, *place) for place in places.tolist()]
+    return figures
 
 
-def _name_lone(points: Sequence[tuple[str, float, float]]) -> list[str]:
+def _name_lone(points: Sequence[LonePoint]) -> list[str]:
     """Return a message about points that are left out of rasters as they are alone, if any are."""
     return [
         f"{count_of(len(points), 'point')} left out of rasters: fewer than two others lie within "

@@ -19,7 +19,7 @@ from ..pipeline.pdal_facts import check_flags, check_inputs, check_units
 from ..pipeline.run import Pipeline
 from .estimate import estimate
 from .inputs import Survey
-from .jobs import InterruptedRun, Job, Store, TiledRun
+from .jobs import InterruptedRun, Store, TiledRun, WritingJob
 from .options import TilingOptions
 from .plan import TilePlan, make_plan
 from .plan_run import PlanRun
@@ -76,7 +76,7 @@ def run_plan(
     *,
     dry_run: bool = False,
     progress: bool | None = None,
-    finished: Callable[[Job], None] | None = None,
+    finished: Callable[[WritingJob], None] | None = None,
     pipeline: Pipeline | None = None,
 ) -> TiledRun:
     """Run a plan; see :func:`run_tiled`.
@@ -87,8 +87,7 @@ def run_plan(
     started = time.monotonic()
     folder = Path(plan.writers[0]["filename"]).absolute().parent
     resumed = chosen.resume and chosen.tile is None
-    known = Store(folder).note("run") if resumed else {}
-    survey = Survey(plan, chosen, known if "square" in known else None)
+    survey = Survey(plan, chosen, Store(folder).grids() if resumed else None)
     plan = replace(plan, copied=plan.copied and chosen.per == "file")
     if not plan.copied:
         _refuse_misread(plan, survey, chosen.per == "tile")
@@ -103,7 +102,7 @@ def run_plan(
     with Store(folder) as store:
         if not chosen.resume:
             store.clear()
-        store.finish("run", "", survey.layout)
+        store.finish("run", survey.grids.to_json())
         try:
             with workers_of(survey.options, str(store.folder)) as workers:
                 run = PlanRun(plan, survey, store, workers, progress)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import StageError
 from ..base.files import whole_files
-from ..base.json_types import JsonObject, StageJson
+from ..base.json_types import StageJson
 from ..base.las import pdal_type
 from ..base.las_check import check_complete
 from ..base.las_copy import LasCopy
@@ -23,9 +23,10 @@ from ..pipeline.inputs_outputs import LAS_WRITERS
 from ..pipeline.run import execute_whole
 from ..stages.points import class_counts
 from .inputs import InputSource
-from .jobs import load_arrays, written
+from .jobs import load_arrays
 from .options import MOST_AT_ONCE
 from .plan import TilePlan
+from .records import OutputRecord, describe_written
 from .sorted_points import Piece
 
 # ---- results of tiles ----------------------------------------------------------------------------
@@ -119,7 +120,7 @@ def run_tail(
     plan: TilePlan,
     outputs: Sequence[str],
     scratch: str,
-) -> JsonObject:
+) -> OutputRecord:
     """Write copies of inputs, in one output or through the stages per output; return a record.
 
     Each input comes with its copy and the parts that are written into it. The `outputs` get their
@@ -145,7 +146,7 @@ def run_tail(
     if plan.copied:
         with whole_files(*outputs, check=complete) as (partial,):
             write(copies[0][1], partial, copies[0][2])
-        return {"outputs": written(outputs), "written": copies[0][1].count, "classes": classes}
+        return OutputRecord(describe_written(outputs), copies[0][1].count, classes)
     with TemporaryDirectory(dir=scratch, ignore_cleanup_errors=True) as folder:
         stages: list[StageJson] = []
         listed: dict[str, str] = {}
@@ -161,7 +162,7 @@ def run_tail(
             named = plan.extra_dims is not None and stage["type"] in LAS_WRITERS and dimensions
             stages.append({"extra_dims": dimensions, **plain} if named else plain)
         run, _ = execute_whole(stages, outputs, check, arrays=False)
-    return {"outputs": written(outputs), "written": run.count, "classes": classes}
+    return OutputRecord(describe_written(outputs), run.count, classes)
 
 
 def _copy(
@@ -181,7 +182,7 @@ def _copy(
 
 def write_file(
     plan: TilePlan, source: InputSource, results: list[str], outputs: list[str], scratch: str
-) -> JsonObject:
+) -> OutputRecord:
     """Write the outputs of a file from the results of its tiles; return the record."""
     assert source.index is not None
     count, layout = source.index.count, source.layout
@@ -203,7 +204,7 @@ def write_file(
 
 def write_tile(
     results: list[PieceResults], plan: TilePlan, outputs: list[str], scratch: str
-) -> JsonObject:
+) -> OutputRecord:
     """Write the points of a tile, from the files that were cut for it; return the record."""
     copies = []
     for piece, rows, values in ((r.piece, r.rows, r.values) for r in results):
@@ -211,4 +212,4 @@ def write_tile(
             types = {name: column.dtype for name, column in values.items()}
             copy = _copy(piece.source, piece.layout, plan, ".las", types)
             copies.append((piece.source, copy, [(piece.records[rows], values)]))
-    return run_tail(copies, plan, outputs, scratch) if copies else {"outputs": []}
+    return run_tail(copies, plan, outputs, scratch) if copies else OutputRecord([])

@@ -152,12 +152,9 @@ def cloud(data: bytes) -> str:
     las.projection_digest(path)
     assert Layout.of_file(path).fields
     extent = inputs.las_extent(str(path))
-    assert (
-        sort_points(str(path), TileGrid(10.0), TileGrid(250.0), str(path.with_suffix(".copy")))[
-            "count"
-        ]
-        == extent.count
-    )
+    copy = str(path.with_suffix(".copy"))
+    index = sort_points(str(path), TileGrid(10.0), TileGrid(250.0), copy)
+    assert index.count == extent.count
     las.supersede_copc(path)
     return "read"
 
