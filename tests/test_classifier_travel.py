@@ -8,6 +8,7 @@ from test_classifier_training import SMALL, scene
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
 from pdal_stages.base.errors import OptionError
+from pdal_stages.base.messages import Topic
 from pdal_stages.classifier.sampling import draw_samples, share_out
 from pdal_stages.classifier.training_clouds import prepared
 from pdal_stages.features.cell_means import density
@@ -87,7 +88,9 @@ def test_a_cloud_of_another_density_is_told():
     assert not report.warnings and report.figures["density"] == pytest.approx(3000 / 3600, rel=0.3)
     subset = slice(None, None, 9)
     report = model.predict(xyz[subset], {k: v[subset] for k, v in dimensions.items()}).report
-    assert "points/m2, the model was trained on" in report.warnings[0]
+    (warning,) = report.warnings
+    assert "points/m2, the model was trained on" in warning.text
+    assert warning.topic is Topic.OTHER_DENSITY
 
 
 # ---- surveys -------------------------------------------------------------------------------------------

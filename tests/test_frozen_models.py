@@ -65,9 +65,8 @@ def test_models_of_other_algorithms_warn_and_say_what_to_do(cloud):
     assert not model.outdated and not model.predict(xyz).report.warnings
     model.info["algorithms"]["filters.multiscalefeatures"] += 1
     (warning,) = model.predict(xyz).report.warnings
-    assert (
-        "version 2 of filters.multiscalefeatures" in warning and "Train the model again" in warning
-    )
+    assert "version 2 of filters.multiscalefeatures" in warning.text
+    assert "Train the model again" in warning.text
 
 
 def test_shipped_models_are_of_the_algorithms_of_this_release():

@@ -81,7 +81,7 @@ def test_a_pipeline_with_other_heights_is_told(ready_town):
         {"type": "filters.hag_morphological", "ground": True, "openings": [5, 17], "window": 20},
     ]
     (warning,) = Pipeline([*other, classify]).expanded.warnings
-    assert "trained on other heights" in warning and '"window": 20' in warning
+    assert "trained on other heights" in warning.text and '"window": 20' in warning.text
 
 
 @pytest.mark.pdal

@@ -203,7 +203,7 @@ def test_larger_cells_where_points_are_few(folder, tmp_path, capsys):
     assert size == 0.5 and "cells of 0.5 m are used, others with --cell" in message
     stage = ps.Pipeline([str(tmp_path / "thin.laz"), {"type": "filters.objects"}])
     stage.execute()
-    assert "set cell to" in " ".join(stage.messages)
+    assert "set cell to" in " ".join(map(str, stage.messages))
 
 
 @pytest.mark.pdal

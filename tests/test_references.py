@@ -146,7 +146,8 @@ def test_inputs_without_a_reference_beside_others_are_said(tmp_path, inputs, ref
     whole = ps.Pipeline(stages)
     whole.execute()
     writer = {"type": "writers.las", "filename": str(tmp_path / "o_#.las")}
-    for messages in (whole.messages, run_tiled([*stages, writer], 40, workers=0).messages):
+    of_tiles = run_tiled([*stages, writer], 40, workers=0).messages
+    for messages in ([*map(str, whole.messages)], of_tiles):
         message = [
             entry for entry in messages if "assumed to have that of the other inputs" in entry
         ]

@@ -8,10 +8,11 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from pdal_stages.base.messages import Message, Topic
 from pdal_stages.pipeline.workers import Cost
 from pdal_stages.surfaces.cells import TileFigures
 from pdal_stages.tiling.inputs import CloudIndex, InputSource
-from pdal_stages.tiling.jobs import InputJob, OutputJob, Store, TileJob
+from pdal_stages.tiling.jobs import InputJob, OutputJob, Store, TileJob, messages_of
 from pdal_stages.tiling.options import TileGrid
 from pdal_stages.tiling.records import (
     FilesRecord,
@@ -33,7 +34,7 @@ TILE = TileRecord(
     widened=True,
     dropped=1,
     classes={"2": 6, "6": 4},
-    messages=["filters.a: a message"],
+    messages=[Message("a message", Topic.METERS_ASSUMED, "filters.a"), Message("another")],
     point_counts={"filters.a.kept": 3},
     shared=[SharedPoints("a.laz", "b.laz", 2)],
 )
@@ -104,3 +105,43 @@ def test_damaged_records_are_none(tmp_path, text):
         for job in (TileJob("a"), InputJob("a", source=InputSource("in.laz", {}))):
             job.keep(store.note("a"))
             assert job.state == "kept" and job.record is None and job.to_dict() == {"state": "kept"}
+
+
+def told(tiles, before=(), inputs=()):
+    """Return the messages of a run whose tiles and earlier rounds have some."""
+    jobs = [
+        TileJob(
+            str(n),
+            state="done",
+            record=TileRecord(**{**vars(TILE), "messages": messages, "shared": []}),
+        )
+        for n, messages in enumerate(tiles)
+    ]
+    return messages_of(jobs, [], inputs, before, 1000)
+
+
+def test_messages_of_tiles_come_once_frequent_ones_first():
+    rare, often = Message("rare", place="filters.a"), Message("often", place="filters.a")
+    assert told([[rare, often], [often]]) == [
+        "filters.a: often (2 tiles)",
+        "filters.a: rare (1 tile)",
+    ]
+    several = Message("often")
+    assert told([[often], [several]]) == ["often (1 tile)"]
+    assert told([[often]], inputs=[Message("odd", Topic.INPUT)]) == [
+        "odd",
+        "filters.a: often (1 tile)",
+    ]
+
+
+def test_that_nothing_matches_is_told_where_it_holds_for_all_tiles():
+    nothing = Message("no points", Topic.NOTHING_MATCHES)
+    assert told([[nothing], []]) == [] and told([[nothing], [nothing]]) == ["no points (2 tiles)"]
+    assert told([[], []], before=[[nothing]]) == ["no points (1 tile)"]
+
+
+def test_what_the_inputs_tell_better_is_left_out():
+    assumed = Message("meters", Topic.METERS_ASSUMED, "filters.a")
+    assert told([[assumed]]) == ["filters.a: meters (1 tile)"]
+    one_has_none = Message("b.laz has none", Topic.NO_REFERENCE)
+    assert told([[assumed]], inputs=[one_has_none]) == ["b.laz has none"]

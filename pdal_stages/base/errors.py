@@ -64,6 +64,10 @@ def _sentence(text: str) -> str:
     return text if text.endswith((".", "?", "!")) else f"{text}."
 
 
+class WriteError(StageError):
+    """A file cannot be written."""
+
+
 class OptionError(StageError):
     """A stage option is unknown, of the wrong type, out of range or contradictory."""
 

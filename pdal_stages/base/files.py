@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from .companions import is_open_database, remove_companions
-from .errors import StageError
+from .errors import StageError, WriteError
 
 LAS = "a LAS or LAZ file"
 MODEL = "a model file"
@@ -79,14 +79,14 @@ def check_writable(path: str | os.PathLike, what: str = "output", kind: str = ""
 
     Raises
     ------
-    StageError
+    WriteError
         If its folder is missing or read-only, its name is too long, or what exists there must not
         be replaced: a folder, a write-protected file, a file of another kind, a database that
         another program has open.
     """
 
     def refuse(problem: str, cure: str | None = None, value: str = str(path)) -> NoReturn:
-        raise StageError(problem.format(what), found=value, cure=cure)
+        raise WriteError(problem.format(what), found=value, cure=cure)
 
     if not os.fspath(path) or "\0" in os.fspath(path):
         refuse("the {} file has no name", "Is a shell variable unset?", ascii(path))
@@ -147,7 +147,7 @@ def _refuse_foreign(path: str | os.PathLike, what: str) -> None:
             return
         if status.st_uid not in _trusted() | {os.stat(folder).st_uid}:
             problem = f"the {what} file is a link or pipe of another user"
-            raise StageError(problem, found=at, cure="Give another name")
+            raise WriteError(problem, found=at, cure="Give another name")
         if stat.S_ISFIFO(status.st_mode):
             return
         at = os.path.join(folder, os.readlink(at))
@@ -342,7 +342,7 @@ def whole_files(
         at = next((p.path for p in places if named.startswith(str(p.folder))), None)
         if inside and named and at is None:  # of something that was read
             raise
-        raise StageError(
+        raise WriteError(
             f"the {what} file could not be written",
             found=f"{at or paths[-1]}: {error.strerror or error}",
             cure="Make room on the disk" if error.errno in NO_ROOM else None,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any
 
 from .json_types import JsonObject
@@ -28,10 +30,53 @@ def shorten(text: str, most: int = 200) -> str:
     return text if len(text) <= most else f"{text[:most]}... ({len(text):,} characters)"
 
 
-def print_messages(*lines: str) -> None:
+class Topic(Enum):
+    """What a message is about, where that decides who shows it."""
+
+    OTHER = "other"
+    #: a file as it is read: runs in tiles report on the inputs, not on what is cut from these
+    INPUT = "input"
+    #: inputs without a spatial reference beside others that have one
+    NO_REFERENCE = "no reference"
+    METERS_ASSUMED = "meters assumed"  #: which a message about the inputs may say better
+    #: no point or polygon meets a condition: normal in a tile, and reported if it holds for all
+    NOTHING_MATCHES = "nothing matches"
+    OTHER_DENSITY = "other density"  #: than that of the clouds the model was trained on
+    SCORE = "score"  #: of a model that was trained, which is described afterwards
+
+
+@dataclass(frozen=True)
+class Message:
+    """A text for the user, and what is known about it."""
+
+    text: str
+    topic: Topic = Topic.OTHER
+    place: str = ""  #: the stage that reports it; empty for others, and where several do
+
+    def __str__(self) -> str:
+        """Return the text after the name of its stage."""
+        return f"{self.place}: {self.text}" if self.place else self.text
+
+    def to_json(self) -> list[str]:
+        """Return the values, as JSON can hold them."""
+        return [self.text, self.topic.value, self.place]
+
+    @classmethod
+    def from_json(cls, text: str, topic: str, place: str) -> Message:
+        """Return a message that was saved; ValueError for an unknown topic."""
+        return cls(text, Topic(topic), place)
+
+
+def without_repeated(messages: Iterable[Message]) -> list[Message]:
+    """Return messages but those of a stage that are there without its name, too."""
+    several = dict.fromkeys(messages)
+    return [m for m in several if not m.place or replace(m, place="") not in several]
+
+
+def print_messages(*lines: str | Message) -> None:
     """Print messages for the user on standard error, each on one line."""
     for line in lines:
-        print(f"pdal-stages: {one_line(line)}", file=sys.stderr)
+        print(f"pdal-stages: {one_line(str(line))}", file=sys.stderr)
 
 
 def count_of(count: int, word: str) -> str:
@@ -86,14 +131,22 @@ class Report:
     #: JSON-able values by name, e.g. ``points`` or ``classes``
     figures: JsonObject = field(default_factory=dict)
     counts: dict[Count, int] = field(default_factory=dict)  #: which are among the figures, too
-    notes: list[str] = field(default_factory=list)  #: what the user should know; nothing is wrong
-    warnings: list[str] = field(default_factory=list)  #: what is likely wrong, and the cure
+    notes: list[Message] = field(default_factory=list)  #: what one should know; nothing is wrong
+    warnings: list[Message] = field(default_factory=list)  #: what is likely wrong, and the cure
     #: By neighborhood, the points whose nearest neighbors lay farther away than the halo: in a tile
     #: of that halo their values may differ from those of the whole cloud.
     beyond_halo: dict[str, int] = field(default_factory=dict)
     reach: float = 0.0  #: meters to the farthest of these neighbors; not in the metadata
     #: number of points of each class code, after a stage that gives classes; not in the metadata
     codes: dict[str, int] | None = None
+
+    def note(self, text: str, topic: Topic = Topic.OTHER) -> None:
+        """Report what the user should know."""
+        self.notes.append(Message(text, topic))
+
+    def warn(self, text: str, topic: Topic = Topic.OTHER) -> None:
+        """Report what is likely wrong."""
+        self.warnings.append(Message(text, topic))
 
     def merge(self, other: Report) -> None:
         """Merge another report into this one. Existing figures stay; dicts are merged by key.
@@ -107,7 +160,7 @@ class Report:
             texts += [text for text in more if text not in texts]
 
     @property
-    def messages(self) -> list[str]:
+    def messages(self) -> list[Message]:
         """Warnings, then notes."""
         return [*self.warnings, *self.notes]
 
@@ -117,7 +170,7 @@ class Report:
         return (
             self.figures
             | ({"beyond_halo": self.beyond_halo} if self.beyond_halo else {})
-            | {name: ". ".join(lines) for name, lines in texts.items() if lines}
+            | {name: ". ".join(map(str, lines)) for name, lines in texts.items() if lines}
         )
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.json_types import JsonObject, StageJson
-from ..base.messages import Report
+from ..base.messages import Message, Report, Topic
 from ..base.progress import Progress
 from ..features import FeaturePlan
 from ..features.cell_means import density
@@ -55,9 +55,6 @@ from .prediction import (
 #: How many times sparser or denser than those trained on a cloud may be without a warning (not
 #: tuned).
 DENSITY_TOLERANCE = 2.0
-
-#: Part of the message about a cloud whose density the model was not trained on.
-OTHER_DENSITY = "points/m2, the model was trained on"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -394,17 +391,18 @@ class Model:
                 columns[name][rows_in_cloud] = values[rows_in_block]
             if progress is not None and work.stands_for_others:
                 progress.update(len(rows_in_cloud))
-        request.report.warnings.extend(self.outdated)
+        request.report.warnings += map(Message, self.outdated)
         if not request.count:
             return
         points_per_m2, trained = density(work.xyz), self.info["densities"]
         request.report.figures["density"] = round(points_per_m2, 3)
         low, high = trained["low"] / DENSITY_TOLERANCE, trained["high"] * DENSITY_TOLERANCE
         if not low <= points_per_m2 <= high:
-            request.report.warnings.append(
-                f"the cloud has {points_per_m2:.3g} {OTHER_DENSITY} "
+            request.report.warn(
+                f"the cloud has {points_per_m2:.3g} points/m2, the model was trained on "
                 f"{model_description.range_text(trained)}. Expect lower accuracy, or train with "
-                "'thin'"
+                "'thin'",
+                Topic.OTHER_DENSITY,
             )
 
 

@@ -7,7 +7,7 @@ import contextlib
 import json
 from pathlib import Path
 
-from ..base.messages import print_messages
+from ..base.messages import Topic, print_messages
 from .parser import INPUTS, Parser, add_stage_options, stage_options
 from .tiled_runs import sigterm_like_ctrl_c
 
@@ -76,8 +76,7 @@ def _train(options: argparse.Namespace) -> None:
         messages = task.run()
     # A model that was written into a pipe or device is not described.
     text = str(load_model(options.model)) if Path(options.model).is_file() else ""
-    score = text.partition("\n")[0]
-    print_messages(*(line for line in messages if not score or not line.endswith(score)))
+    print_messages(*(m for m in messages if not text or m.topic is not Topic.SCORE))
     if text:
         print(text)
 

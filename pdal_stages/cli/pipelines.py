@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.errors import StageError
 from ..base.files import JSON, Output, check_outputs, write_json, write_whole
-from ..base.messages import print_messages
+from ..base.messages import Message, print_messages
 from .parser import Parser
 from .tiled_runs import (
     add_tile_options,
@@ -93,9 +93,9 @@ def _pipeline(options: argparse.Namespace) -> int:
     pipeline.execute(arrays=False, loglevel=_LEVELS.get(options.verbose, logging.DEBUG))
     # Warnings, and what PDAL calls an error although it goes on: a reader that sets what it cannot
     # read to 0, say.
-    lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
+    lines = pipeline.log_messages
     if options.verbose < 2 and len(lines) > _LOG_LINES:
-        more = f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v 2 shows them"
+        more = Message(f"PDAL says {len(lines) - _LOG_LINES:,} more lines; -v 2 shows them")
         lines = [*lines[:_LOG_LINES], more]
     print_messages(*lines)
     if options.metadata:

@@ -15,7 +15,7 @@ from ..base.json_types import StageJson
 from ..base.las import header_there
 from ..base.las_check import check_readable
 from ..base.las_points import LasColumns, Layout
-from ..base.messages import Report
+from ..base.messages import Message, Report
 from ..base.progress import Progress
 from ..base.units import METERS_PER_DEGREE, is_geographic
 from ..stages.accuracy import AccuracyStage
@@ -43,7 +43,7 @@ def compare_files(
     reference_dimension: str,
     overrides: Sequence[Override] = (),
     **outputs: str,
-) -> list[str]:
+) -> list[Message]:
     """Compare files with others that hold the same points in the same order, paired by name.
 
     Returns messages for the user. Both are files, folders or patterns; `outputs` are options of

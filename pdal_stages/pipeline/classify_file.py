@@ -14,6 +14,7 @@ from ..base.json_types import StageJson
 from ..base.las_check import beyond_box, check_complete
 from ..base.las_copy import LasCopy
 from ..base.las_points import LasColumns, Layout, layout_there
+from ..base.messages import Message
 from ..stages.points import RESERVED
 from .classify_request import ClassifyRequest
 from .copies import (
@@ -30,7 +31,7 @@ from .spatial_reference import text_of
 
 def classify_file(
     pipeline: Pipeline, request: ClassifyRequest, source: str
-) -> tuple[int, list[str]]:
+) -> tuple[int, list[Message]]:
     """Run the pipeline of a request; return the number of points written, and messages.
 
     The pipeline's reports and metadata are those of the run afterwards.
@@ -50,11 +51,7 @@ def classify_file(
     extra = layout.extra_by_name if layout else ()
     pipeline.select(request.where, {*request.creates} - {*extra})
     count = pipeline.execute(arrays=False)
-    return count, [*_log_of(pipeline), *pipeline.messages]
-
-
-def _log_of(pipeline: Pipeline) -> list[str]:
-    return [f"PDAL says: {line}" for line in pipeline.log_lines]
+    return count, [*pipeline.log_messages, *pipeline.messages]
 
 
 def _refuse_lost_dimensions(layout: Layout, request: ClassifyRequest) -> None:
@@ -69,7 +66,9 @@ def _refuse_lost_dimensions(layout: Layout, request: ClassifyRequest) -> None:
             )
 
 
-def _copy(pipeline: Pipeline, request: ClassifyRequest, layout: Layout) -> tuple[int, list[str]]:
+def _copy(
+    pipeline: Pipeline, request: ClassifyRequest, layout: Layout
+) -> tuple[int, list[Message]]:
     """Read a LAS file, run the stages, and write a copy of it."""
     reader, *_, writer = pipeline.source.stages
     source, target = str(reader["filename"]), str(writer["filename"])
@@ -78,21 +77,21 @@ def _copy(pipeline: Pipeline, request: ClassifyRequest, layout: Layout) -> tuple
     wkt, note = text_of(reader)
     columns = LasColumns([(layout, source)])
     known = selection(request.where, columns)
-    messages = [note, beyond_box(source, _box_of(columns))]
+    messages = [Message(text) for text in (note, beyond_box(source, _box_of(columns))) if text]
     messages += describe_selection(request.where, known)
     seen = pipeline.run_here(columns, wkt, known)
     values = {name: seen[name] for name in ("Classification", *request.extra_dims)}
     messages += pipeline.messages
     del seen, columns, known
     if not pipeline.copied:
-        return copy.count, [*filter(None, messages), *_write_through_pdal(copy, values, writer)]
+        return copy.count, [*messages, *_write_through_pdal(copy, values, writer)]
 
     def check(partial: Path, final: Path, number: int) -> None:
         check_complete(partial, final, writer, copy.count)
 
     with whole_files(target, check=check) as (partial,):
         write_copy(copy, partial, values)
-    return copy.count, [*filter(None, messages)]
+    return copy.count, messages
 
 
 def _box_of(columns: Mapping[str, NDArray]) -> tuple[float, float, float, float]:
@@ -105,7 +104,7 @@ def _box_of(columns: Mapping[str, NDArray]) -> tuple[float, float, float, float]
 
 def _write_through_pdal(
     copy: LasCopy, values: Mapping[str, NDArray], writer: StageJson
-) -> list[str]:
+) -> list[Message]:
     """Let PDAL write what a copy would hold, by the options of a writer; return its log."""
     folder = Path(writer["filename"]).absolute().parent
     with TemporaryDirectory(prefix=".pdal-stages-copy-", dir=folder) as beside:
@@ -116,4 +115,4 @@ def _write_through_pdal(
         extra = {"extra_dims": listed} if listed else {}
         tail = Pipeline([reader, {**extra, **writer}])
         tail.execute(arrays=False)
-    return _log_of(tail)
+    return tail.log_messages

@@ -17,8 +17,8 @@ from ..base.json_types import StageJson
 from ..base.las import named_copc, number_type, pdal_type
 from ..base.las_copy import LasCopy
 from ..base.las_points import PART, Layout, describe, read_records
-from ..base.messages import shorten
-from ..stages.points import NO_POINT_MATCHES, SELECTED
+from ..base.messages import Message
+from ..stages.points import SELECTED, no_point_matches
 from ..stages.registry import stage_types
 from ..stages.where_expression import Expression
 from . import pdal as pdal_env
@@ -99,11 +99,11 @@ def selection(where: str | None, columns: Mapping[str, NDArray]) -> dict[str, ND
     return {SELECTED: Expression(where).evaluate(columns).astype(np.uint8)}
 
 
-def describe_selection(where: str | None, known: Mapping[str, NDArray]) -> list[str]:
+def describe_selection(where: str | None, known: Mapping[str, NDArray]) -> list[Message]:
     """Return a message where a condition selects no point."""
     chosen = known.get(SELECTED)
     nothing = chosen is not None and len(chosen) and not chosen.any()
-    return [f"{NO_POINT_MATCHES} {shorten(str(where))}"] if nothing else []
+    return [no_point_matches(str(where))] if nothing else []
 
 
 def copy_of(

@@ -16,6 +16,7 @@ from ..base.dimensions import known
 from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.json_types import StageJson
 from ..base.las_points import layout_there
+from ..base.messages import Message
 from ..classifier.model_file import find
 from ..features.registry import BY_NAME
 from ..stages import preprocessing
@@ -41,7 +42,7 @@ class Expanded:
 
     stages: list[StageJson]
     ours: list[ExpandedStage] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Message] = field(default_factory=list)
 
 
 def expand(
@@ -182,7 +183,7 @@ def _place_upstream(expanded: Expanded) -> None:
         if ours.stage.upstream:
             plain["pdalargs"]["preparation"] = list(ours.stage.upstream)
         if (warning := ours.stage.check_upstream()) is not None:
-            expanded.warnings.append(warning)
+            expanded.warnings.append(Message(warning))
         before.append((ours.as_written, ours.stage.creates()))
 
 

@@ -9,6 +9,7 @@ import os
 import re
 from collections import ChainMap, Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,7 +21,7 @@ from ..base.files import Output, check_outputs, whole_files
 from ..base.json_types import JsonObject, StageJson
 from ..base.las import refuse_pipe, supersede_copc
 from ..base.las_check import check_complete, check_readable
-from ..base.messages import Report
+from ..base.messages import Message, Report, Topic
 from ..base.octrees import check_copc, check_ept
 from ..base.text_points import check_text
 from ..stages.registry import stage_types
@@ -90,7 +91,7 @@ class Pipeline:
         self.metadata: JsonObject = {}
         self.arrays: list = []
         self.log_lines: list[str] = []
-        self.warnings: list[str] = []
+        self.warnings: list[Message] = []
         self._where: str | None = None
         self._sets_scales = may_copy  #: whether LAS files hold what a text has
         self._unknown: Collection[str] = ()
@@ -114,17 +115,22 @@ class Pipeline:
         return dict(+counts)
 
     @property
-    def messages(self) -> list[str]:
+    def messages(self) -> list[Message]:
         """Warnings of the pipeline, then warnings and notes of our stages, each once."""
-        places: dict[str, dict[str, None]] = {}
+        places: dict[Message, dict[str, None]] = {}
         for place, reports in self.reports:
-            for text in [text for report in reports for text in report.messages]:
-                places.setdefault(text, {})[place] = None
+            for message in [message for report in reports for message in report.messages]:
+                places.setdefault(message, {})[place] = None
         of_stages = [
-            text if len(stages) > 1 else f"{next(iter(stages))}: {text}"
-            for text, stages in places.items()
+            message if len(stages) > 1 else replace(message, place=next(iter(stages)))
+            for message, stages in places.items()
         ]
         return [*self.warnings, *of_stages]
+
+    @property
+    def log_messages(self) -> list[Message]:
+        """Warnings and errors of PDAL's log."""
+        return [Message(f"PDAL says: {line}") for line in self.log_lines]
 
     @property
     def json(self) -> str:
@@ -284,7 +290,8 @@ class Pipeline:
             )
         check_dimensions(self.expanded)
         files = readers_files(stages, las=True)
-        self.warnings = [*self.expanded.warnings, *filter(None, map(check_readable, files))]
+        odd = filter(None, map(check_readable, files))
+        self.warnings = [*self.expanded.warnings, *(Message(text, Topic.INPUT) for text in odd)]
         if pdal:
             pdal_facts.check_inputs(stages)
             pdal_facts.check_units(stages)

@@ -22,6 +22,7 @@ from ..base.las import (
     records_of,
 )
 from ..base.las_check import check_readable
+from ..base.messages import Message, Topic
 from ..base.units import (
     SYSTEMS,
     Units,
@@ -46,8 +47,6 @@ MOVING = (
 #: separately.
 _ALIKE = ("+datum=WGS84", "+datum=NAD83", "+ellps=WGS84", "+ellps=GRS80")
 _ASIDE = re.compile(r"\+(v?units|v?to_meter|towgs84|geoidgrids|no_defs|type|wktext)")
-#: Part of the message about inputs that have none, next to others.
-NO_REFERENCE = "no spatial reference;"
 
 
 @dataclass(frozen=True)
@@ -257,7 +256,7 @@ def records_for(named: str, path: str) -> list[tuple[int, bytes]]:
     return [(_KEYS[0], b"".join(struct.pack("<4H", *row) for row in rows))]
 
 
-def check_one_reference(references: Mapping[str, Reference]) -> list[str]:
+def check_one_reference(references: Mapping[str, Reference]) -> list[Message]:
     """Refuse inputs, by path, with different units or reference systems.
 
     Where one has no reference, only units are compared. Return messages: which inputs have no
@@ -292,10 +291,11 @@ def check_one_reference(references: Mapping[str, Reference]) -> list[str]:
         return []
     listed = ", ".join(paths[:3]) + (f" and {len(paths) - 3:,} more" if len(paths) > 3 else "")
     has, taken = ("has", "it is") if len(paths) == 1 else ("have", "they are")
-    return [f"{listed} {has} {NO_REFERENCE} {taken} assumed to have that of the other inputs"]
+    text = f"{listed} {has} no spatial reference; {taken} assumed to have that of the other inputs"
+    return [Message(text, Topic.NO_REFERENCE)]
 
 
-def check_readers(stages: list[StageJson], horizontal: str = "") -> list[str]:
+def check_readers(stages: list[StageJson], horizontal: str = "") -> list[Message]:
     """Refuse a pipeline whose LAS readers read different references; return messages.
 
     A pipeline with a stage that moves points (:data:`MOVING`) is not checked.

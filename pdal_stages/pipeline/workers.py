@@ -50,6 +50,7 @@ class TaskResult:
 
     result: Any = None
     reason: str = ""  #: why it failed; empty where it did not
+    failure: type[Exception] | None = None  #: the error
     cost: Cost = Cost()
 
 
@@ -63,7 +64,7 @@ def perform_task(task: Task) -> TaskResult:
         except InterruptedStage:
             raise KeyboardInterrupt from None
         except Exception as error:
-            out.reason = _reason(error)
+            out.reason, out.failure = _reason(error), type(error)
         out.cost = Cost(time.perf_counter() - started, time.process_time() - cpu, _peak())
         return out
 

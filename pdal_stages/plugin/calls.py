@@ -53,7 +53,7 @@ def answer(module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArr
             warnings = [warning] if warning else []
         else:
             report = runtime.run_on_view(stage, context, module, ins, outs)
-            leaves, warnings = runtime.leaves(report), report.messages
+            leaves, warnings = runtime.leaves(report), [*map(str, report.messages)]
         leaves += [runtime.leaf("pdal_stages_warning", text) for text in warnings]
     except BaseException as error:
         outs.clear()

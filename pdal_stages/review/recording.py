@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from ..base.columns import SomeRows
 from ..base.errors import NoTerrainError
 from ..base.grid import GridWindow
+from ..base.messages import Topic
 from ..classifier.interface import ClassStep, PassInputs
-from ..classifier.model import OTHER_DENSITY
 from ..pipeline.copies import run_stages, selection
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import ExpandedStage, points_of
@@ -161,8 +161,8 @@ class Recording(Observer):
         known[_OUTSIDE] = outside
         seen = run_stages(ours[reaches.first :], self.cloud, wkt, known, self._keep_classes)
         self.results = SomeRows(seen, self.rows)
-        texts = [*pipeline.expanded.warnings, *pipeline.messages]
-        self.notes = [text for text in texts if OTHER_DENSITY not in text]
+        messages = [*pipeline.expanded.warnings, *pipeline.messages]
+        self.notes = [str(each) for each in messages if each.topic is not Topic.OTHER_DENSITY]
 
     def _box(self, reach: float) -> Box:
         """Return the box of the points in question, wider by a reach in units of coordinates."""

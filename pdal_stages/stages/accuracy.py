@@ -227,7 +227,7 @@ class AccuracyStage(Stage):
                 **(rule["merge"] or {}),
                 HIGH_VEGETATION: sorted({HIGH_VEGETATION, *LOWER}),
             }
-            report.notes.append(
+            report.note(
                 "vegetation is one class, 5, in what is judged: of the reference "
                 f"{' and '.join(map(str, parts))} count as "
                 "5, too. To compare them as they are: --filters.accuracy.merge='{}'"

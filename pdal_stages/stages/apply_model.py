@@ -333,7 +333,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
             doubt = doubt_vertical_unit(
                 leaf_heights, slope, points.units.vertical, elevation, too_flat
             )
-            points.report.warnings += [doubt] if doubt else []
+            if doubt:
+                points.report.warn(doubt)
         if self.mark:
             values[self.mark] = inside
         return values

@@ -64,5 +64,5 @@ def select_checked(
             chosen[rows[hash_rows(points.xyz[rows].T, seed) / 2.0**64 < share]] = True
         text += f", and from about {beside:,} others of which the base is sure: it is kept where "
         text += "nobody looked"
-    points.report.notes.append(text)
+    points.report.note(text)
     return chosen

@@ -83,9 +83,9 @@ class ObjectOptions:
         except StageError as error:
             if not context.outside:
                 raise
-            points.report.warnings.append(str(error))
+            points.report.warn(str(error))
         if thin := cells.sparse_kind():
-            points.report.warnings.append(
+            points.report.warn(
                 f"cells of {cells.size:g} m hold fewer than {MIN_POINTS_PER_CELL:g} points of "
                 f"{thin[0]} on average, so objects may fall apart: set cell to {2 * cells.size:g} "
                 "or more"

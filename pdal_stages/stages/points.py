@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..base.asprs import LEGACY_LIMIT, OVERLAP
 from ..base.dimensions import is_height
 from ..base.errors import DimensionError, OptionError, StageError
-from ..base.messages import Count, Report, shorten
+from ..base.messages import Count, Message, Report, Topic, shorten
 from ..base.units import Units, refuse_likely_degrees, units_of_wkt
 from .options import Selection
 from .where_expression import Expression
@@ -29,12 +29,6 @@ MAKERS = {
     '"Classification=>Reference"}',
     "Ground": 'Add {"type": "filters.hag_morphological", "ground": true} before this stage',
 }
-#: The note on points without a spatial reference. Tiles show it where no input has one.
-METERS_ASSUMED = "the points have no spatial reference: meters were assumed"
-#: How the warning begins that a `where` matches no point. Tiles show it if it holds for all.
-NO_POINT_MATCHES = "'where' matches no points:"
-#: The same for polygons of a file that lie nowhere near the points.
-NO_POLYGON_NEAR = "no polygon lies where the points are (check the reference systems of both):"
 #: How names of dimensions begin that runs use for themselves.
 RESERVED = "PdalStages"
 #: The dimension in which `classify` marks the points that its `where` selects.
@@ -52,6 +46,11 @@ LAS_DIMENSIONS = (
 _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 #: How far rounding may take a share beyond 0 or 1.
 _SHARE_ROUNDING = 1e-5
+
+
+def no_point_matches(where: str) -> Message:
+    """Return the warning that a condition holds for no point."""
+    return Message(f"'where' matches no points: {shorten(where)}", Topic.NOTHING_MATCHES)
 
 
 @dataclass(eq=False)
@@ -89,7 +88,7 @@ class Points:
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             # Where `classify` marked no point, the stage that marks them has said so.
             if self.count and not self.report.figures["where"] and SELECTED not in self.where.text:
-                self.report.warnings.append(f"{NO_POINT_MATCHES} {shorten(self.where.text)}")
+                self.report.warnings.append(no_point_matches(self.where.text))
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -115,7 +114,8 @@ class Points:
             self.wkt, horizontal=self.unit_names[0], vertical=self.unit_names[1], place=place
         )
         if units.assumed and self.count:
-            self.report.notes.append(METERS_ASSUMED)
+            text = "the points have no spatial reference: meters were assumed"
+            self.report.note(text, Topic.METERS_ASSUMED)
             refuse_likely_degrees(self.count, x.min(), y.min(), x.max(), y.max())
         return units
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.messages import Count
+from ..base.messages import Count, Message, Topic
 from ..base.vector import Overlay, inside_of, with_vector
 from .base import ClassStage, StageContext
 from .options import Selection, ignore_option, keep_option, option
-from .points import NO_POLYGON_NEAR, Points, class_counts
+from .points import Points, class_counts
 
 
 class Polygons(ClassStage):
@@ -66,9 +66,10 @@ class Polygons(ClassStage):
             counts[f"{name}={overlay.code}"] = {"polygons": polygons, "points": len(rows)}
             notes += [note] if note else []
             if not polygons:
-                points.report.warnings.append(f"{NO_POLYGON_NEAR} {name}")
+                text = "no polygon lies where the points are (check the reference systems of both)"
+                points.report.warn(f"{text}: {name}", Topic.NOTHING_MATCHES)
         points.report.figures["polygons"] = counts
         points.tally(self.inside, changed)
         points.report.figures["classes"] = class_counts(codes[change])
-        points.report.notes += notes
+        points.report.notes += map(Message, notes)
         return {"Classification": points.with_codes(codes)}

@@ -15,7 +15,7 @@ from ..base.distinct import DistinctPoints
 from ..base.errors import ModelError, OptionError
 from ..base.files import MODEL, Output
 from ..base.json_types import JsonObject, StageJson
-from ..base.messages import Report
+from ..base.messages import Report, Topic
 from ..classifier import model_description
 from ..classifier.calibration import calibrate_on_base
 from ..classifier.class_map import ClassMap
@@ -224,7 +224,7 @@ class TrainModel(Stage, settings=TrainingOptions):
         gone = points.ignored(replace(self.ignore, codes=()))
         again = ~(distinct or DistinctPoints()).first(points.arrays)
         if repeated := np.count_nonzero(again):
-            points.report.notes.append(
+            points.report.note(
                 f"{repeated:,} of {points.count:,} points come twice, at the same place and time, "
                 "and are counted once"
             )
@@ -255,15 +255,15 @@ class TrainModel(Stage, settings=TrainingOptions):
         shown = {key: value for key, value in model.info.items() if key in _SHOWN}
         report.figures |= {"model": self.filename, **shown}
         for code, (all_, held) in model.info["training"].get("held_by_base", {}).items():
-            report.warnings.append(
+            report.warn(
                 f"the base assigns {held:,} of {all_:,} samples of class {code} to classes "
                 "without labels, where they stay: label some of those classes too"
             )
         if unscored := model.info["training"].get("unscored"):
-            report.warnings.append(unscored)
+            report.warn(unscored)
         if model_description.held_out(model.info):
             report.figures["score"] = model_description.score(model.info)
-            report.notes.append(report.figures["score"])
+            report.note(report.figures["score"], Topic.SCORE)
 
     def _mask(self, points: Points) -> NDArray[np.bool_] | None:
         """Return which points (n,) samples are drawn from; None for all."""

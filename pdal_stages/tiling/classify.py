@@ -116,7 +116,8 @@ class ClassifyTask:
             "classes": output.record.classes,
             "point_counts": pipeline.point_counts,
         }
-        return TiledRun([], [output], {}, [], messages, summary, metadata=pipeline.metadata)
+        texts = [*map(str, messages)]
+        return TiledRun([], [output], {}, [], texts, summary, metadata=pipeline.metadata)
 
     def run_tiles(
         self, *, dry_run: bool = False, finished: Callable[[WritingJob], None] | None = None

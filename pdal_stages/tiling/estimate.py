@@ -34,4 +34,4 @@ def estimate(plan: TilePlan, survey: Survey) -> TiledRun:
         "disk_gb": kept / 1e9,
         "states": {"waiting": len(tiles)},
     }
-    return TiledRun(tiles, [], survey.faults, [], survey.messages, summary)
+    return TiledRun(tiles, [], survey.faults, [], [*map(str, survey.messages)], summary)

@@ -22,6 +22,7 @@ from ..base.grid import cell_keys, key_offset, places_among
 from ..base.hashing import digest_of_file, fingerprint
 from ..base.json_types import JsonObject, StageJson
 from ..base.las_points import Layout
+from ..base.messages import Message, Topic
 from ..base.units import Units
 from ..pipeline.copies import layout_read_by, reader_of_copy
 from ..pipeline.inputs_outputs import LAS_READERS, locations
@@ -257,9 +258,9 @@ class Survey:
                 odd += filter(None, [las_check.check_readable(source.path)])
             except StageError as error:
                 source.fault = str(error)
-        self.messages += copies_among(self.sources)
+        self.messages += map(Message, copies_among(self.sources))
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
-        self.messages += [f"{message}{more}" for message in odd[:1]]
+        self.messages += [Message(f"{text}{more}", Topic.INPUT) for text in odd[:1]]
 
     def measure_density(self) -> Density:
         """Return the density of the inputs, by which tiles are chosen."""
@@ -291,13 +292,11 @@ class Survey:
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if plan.one_reference:
             messages = check_one_reference(references)
-            if messages and per == "file":
-                messages[0] += (
-                    ", and the output gets none: --readers.las.default_srs=EPSG:CODE names it in "
-                    "both"
-                )
-            self.messages += messages
-        self.messages += filter(None, dict.fromkeys(each.note for each in references.values()))
+            name_it = "--readers.las.default_srs=EPSG:CODE names it in both"
+            more = f", and the output gets none: {name_it}" if per == "file" else ""
+            self.messages += [replace(each, text=f"{each.text}{more}") for each in messages]
+        notes = dict.fromkeys(each.note for each in references.values())
+        self.messages += map(Message, filter(None, notes))
         first, *others = references.values()
         return next((each for each in others if each.name and not first.name), first)
 

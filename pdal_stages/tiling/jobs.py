@@ -23,10 +23,9 @@ from ..base.columns import LazyColumns
 from ..base.errors import StageError
 from ..base.files import make_own_folder, try_lock, whole_files
 from ..base.json_types import JsonObject
-from ..base.messages import count_of
+from ..base.messages import Message, Topic, count_of, without_repeated
 from ..base.version import __version__
 from ..pipeline.workers import Cost
-from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR
 from .inputs import CloudIndex, InputSource
 from .records import (
     ARRAYS,
@@ -67,6 +66,8 @@ class Job:
     record_type: type[JobRecord] = field(default=FilesRecord, kw_only=True)
     cost: Cost | None = field(default=None, kw_only=True)  #: of its task
     reason: str = field(default="", kw_only=True)  #: why it failed
+    #: the error of its task; None where it failed without
+    failure: type[Exception] | None = field(default=None, kw_only=True)
     blocked: bool = field(default=False, kw_only=True)  #: an unreadable input is the reason
 
     def fail(self, reason: str, blocked: bool = False) -> None:
@@ -81,7 +82,7 @@ class Job:
     def keep(self, saved: JsonObject) -> None:
         """Mark it as kept from an earlier run, with what that saved, unless it is damaged."""
         self.state = "kept"
-        with contextlib.suppress(TypeError, KeyError):
+        with contextlib.suppress(TypeError, KeyError, ValueError):
             self.record = self.record_type.from_json(saved)
             self.cost = Cost(**{each.name: saved[each.name] for each in fields(Cost)})
 
@@ -93,8 +94,9 @@ class Job:
     def to_dict(self) -> JsonObject:
         """Return what a report tells of it, as of all jobs."""
         reason = {"reason": self.reason} if self.reason else {}
-        known = {k: v for k, v in self.to_json().items() if k != "outputs"}
-        return {"state": self.state, **known, **reason}
+        record = {} if self.record is None else self.record.to_report()
+        cost = {} if self.cost is None else vars(self.cost)
+        return {"state": self.state, **record, **cost, **reason}
 
 
 @dataclass
@@ -228,23 +230,32 @@ def summarize(
 
 
 def messages_of(
-    tiles: list[TileJob], squares: list[TileJob], before: list[Sequence[str]], most_points: int
+    tiles: list[TileJob],
+    squares: list[TileJob],
+    inputs: Sequence[Message],
+    before: list[Sequence[Message]],
+    most_points: int,
 ) -> list[str]:
-    """Return warnings and notes of tiles and earlier rounds, once each, frequent ones first."""
+    """Return the messages about inputs, then those of tiles and of the rounds before.
+
+    These come once each, frequent ones first.
+    """
     done = _records_of(_done(tiles))
-    counts: Counter[str] = Counter()
+    counts: Counter[Message] = Counter()
     for lines in ([record.messages for record in done if record.points], before):
-        for text, n in Counter(text for each in lines for text in dict.fromkeys(each)).items():
-            if not text.startswith((NO_POINT_MATCHES, NO_POLYGON_NEAR)):
-                counts[text] += n
-            elif n == len(lines):  # that there is nothing to do in some tiles is normal
-                counts[text] = max(counts[text], n)
-    # Messages of one stage that several stages report, too.
-    for text in [text for text in counts if text.partition(": ")[2] in counts]:
-        del counts[text]
-    messages = [f"{text} ({count_of(n, 'tile')})" for text, n in counts.most_common(_MOST_MESSAGES)]
-    if len(counts) > _MOST_MESSAGES:
-        messages.append(f"and {len(counts) - _MOST_MESSAGES} more; see --report")
+        for message, n in Counter(each for line in lines for each in dict.fromkeys(line)).items():
+            if message.topic is not Topic.NOTHING_MATCHES:
+                counts[message] += n
+            elif n == len(lines):
+                counts[message] = max(counts[message], n)
+    shown = Counter({message: counts[message] for message in without_repeated(counts)})
+    if any(each.topic is Topic.NO_REFERENCE for each in inputs):  # it tells what is assumed
+        for message in [each for each in shown if each.topic is Topic.METERS_ASSUMED]:
+            del shown[message]
+    messages = [*map(str, inputs)]
+    messages += [f"{m} ({count_of(n, 'tile')})" for m, n in shown.most_common(_MOST_MESSAGES)]
+    if len(shown) > _MOST_MESSAGES:
+        messages.append(f"and {len(shown) - _MOST_MESSAGES} more; see --report")
     if short := [job.name for job in [*_done(tiles), *squares] if job.is_short]:
         messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "

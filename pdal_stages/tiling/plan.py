@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..base.files import LAS, Output, check_outputs
 from ..base.json_types import StageJson
+from ..base.messages import Message
 from ..classifier.model_file import shipped
 from ..pipeline.copies import read_here
 from ..pipeline.inputs_outputs import named_outputs, outputs_of, writes_las
@@ -44,7 +45,7 @@ class TilePlan:
     #: Dimensions that stages in tiles change; None where unknown because of PDAL's filters in it.
     creates: list[str] | None
     unit: str  #: `horizontal_unit` of our stages; empty: the unit of the spatial reference
-    messages: list[str]  #: messages for the user
+    messages: list[Message]  #: messages for the user
     name: str  #: the pipeline's file, or another name of its source
     #: Created dimensions that LAS files get besides the input's own; None leaves it to the writer.
     extra_dims: dict[str, str] | None = None

@@ -10,10 +10,9 @@ from functools import cached_property, partial
 from typing import Any
 
 from ..base.hashing import fingerprint
+from ..base.messages import Message
 from ..base.version import build
-from ..pipeline.spatial_reference import NO_REFERENCE
 from ..pipeline.workers import Workers
-from ..stages.points import METERS_ASSUMED
 from .inputs import Survey
 from .jobs import OutputJob, Store, TiledRun, TileJob, WritingJob, messages_of, summarize
 from .plan import RunContext, TilePlan, outputs_for
@@ -34,7 +33,7 @@ class PlanRun(SurveyRun):
         self.squares: list[TileJob] = []  #: of the rounds before the last
         #: one for each input file; empty where each tile is an output
         self.outputs: list[OutputJob] = []
-        self.messages_before: list[Sequence[str]] = []  #: of the rounds before the last
+        self.messages_before: list[Sequence[Message]] = []  #: of the rounds before the last
         #: How far around a tile, in units of the coordinates, inputs are available: its halo may
         #: have to grow (four halos are room for that, not tuned).
         halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
@@ -50,10 +49,9 @@ class PlanRun(SurveyRun):
             "peak_mb_of_a_worker": self.peak_mb,
         }
         most = survey.options.most_points
-        messages = messages_of(self.tiles, self.squares, self.messages_before, most)
-        if any(NO_REFERENCE in text for text in survey.messages):  # it tells what is assumed
-            messages = [text for text in messages if METERS_ASSUMED not in text]
-        messages = survey.messages + messages
+        messages = messages_of(
+            self.tiles, self.squares, survey.messages, self.messages_before, most
+        )
         changed = survey.changed()
         return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
 
@@ -199,10 +197,10 @@ class PlanRun(SurveyRun):
         self.store.remove(".npz", needed)
 
 
-def _name_outputs(what: str, paths: Sequence[str]) -> list[str]:
+def _name_outputs(what: str, paths: Sequence[str]) -> list[Message]:
     """Return a message about outputs, if there are any."""
     more = f" and {len(paths) - 3:,} more" if len(paths) > 3 else ""
-    return [f"{what}: {', '.join(paths[:3])}{more}"] if paths else []
+    return [Message(f"{what}: {', '.join(paths[:3])}{more}")] if paths else []
 
 
 def _make_ready(out: OutputJob, waiting: deque[WritingJob]) -> None:

@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeVar
 
 from ..base.hashing import digest_of_file
 from ..base.json_types import JsonObject
+from ..base.messages import Message
 
 #: How the files of arrays end, which tiles leave for outputs.
 ARRAYS = ".npz"
@@ -57,6 +58,10 @@ class JobRecord:
         """Return the fields that are not None, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
+    def to_report(self) -> JsonObject:
+        """Return what a report tells of it."""
+        return {name: value for name, value in self.to_json().items() if name != "outputs"}
+
     @classmethod
     def from_json(cls: type[_Record], saved: JsonObject) -> _Record:
         """Return the record that was saved, among other things; TypeError where it is damaged."""
@@ -102,7 +107,7 @@ class TileRecord(JobRecord):
     widened: bool  #: whether it is wider than planned
     dropped: int  #: points that stages removed
     classes: Mapping[str, int]  #: points by class code
-    messages: Sequence[str]  #: warnings and notes
+    messages: Sequence[Message]
     point_counts: Mapping[str, int]  #: by ``type.name``
     shared: Sequence[SharedPoints]
     outputs: Sequence[WrittenFile] = ()  #: or the file of the arrays
@@ -112,6 +117,20 @@ class TileRecord(JobRecord):
         """Take files and shared points as JSON holds them, too."""
         self.shared = [SharedPoints(*entry) for entry in self.shared]
         self.outputs = [WrittenFile(*entry) for entry in self.outputs]
+
+    def to_json(self) -> JsonObject:
+        """Return the fields that are not None, by name."""
+        return super().to_json() | {"messages": [each.to_json() for each in self.messages]}
+
+    def to_report(self) -> JsonObject:
+        """Return what a report tells of it."""
+        return super().to_report() | {"messages": [*map(str, self.messages)]}
+
+    @classmethod
+    def from_json(cls, saved: JsonObject) -> TileRecord:
+        """Return the record that was saved; TypeError or ValueError where it is damaged."""
+        messages = [Message.from_json(*entry) for entry in saved.get("messages", ())]
+        return super().from_json({**saved, "messages": messages})
 
 
 @dataclass(frozen=True)

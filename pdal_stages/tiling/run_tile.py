@@ -35,14 +35,13 @@ from ..base.errors import NoTerrainError, PipelineError
 from ..base.json_types import StageJson
 from ..base.las_copy import LasCopy
 from ..base.las_points import LasColumns
-from ..base.messages import shorten
+from ..base.messages import Message, Topic
 from ..pipeline.copies import selection
 from ..pipeline.pdal_facts import check_class_codes
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
-from ..pipeline.spatial_reference import NO_REFERENCE
 from ..stages.base import WHOLE_CLOUD
-from ..stages.points import NO_POINT_MATCHES, NO_POLYGON_NEAR, RESERVED, SELECTED, class_counts
+from ..stages.points import RESERVED, SELECTED, class_counts, no_point_matches
 from ..stages.registry import stage_types
 from .earlier_rounds import (
     ChangedValues,
@@ -72,7 +71,7 @@ class RoundResult(NamedTuple):
 
     results: list[PieceResults]
     halo_needed_m: float = 0.0
-    messages: Sequence[str] = ()  #: warnings and notes
+    messages: Sequence[Message] = ()
     point_counts: Mapping[str, int] = {}  #: counts of its own points, by ``type.name``
     reduced: Sequence[dict[str, NDArray]] = ()  #: what blocks need of its own points
 
@@ -113,9 +112,9 @@ class _RoundRun:
                 far = part.stages[numbers[number] - part.begin]
                 distance_m = far.used_m + far.before_m
                 self.needs_m += [distance_m + r.reach for r in stage.reports if r.beyond_halo]
-        messages = _messages(pipeline, self.context.scratch)
+        messages = _messages(pipeline)
         if plan.where and len(origins) and not any(each[SELECTED].any() for each in origins):
-            messages.append(f"{NO_POINT_MATCHES} {shorten(plan.where)}")
+            messages.append(no_point_matches(plan.where))
         return RoundResult(
             _collect(self.views, self.pieces),
             max(self.needs_m),
@@ -259,16 +258,15 @@ def _merges(stage: StageJson) -> bool:
     return stage["type"] in ("filters.merge", *stage_types())
 
 
-def _messages(pipeline: Pipeline, scratch: str) -> list[str]:
-    """Return messages of a tile, the same words for every tile; none about files in `scratch`."""
-    lines = [f"PDAL says: {line}" for line in pipeline.log_lines]
-    for text in pipeline.messages:
-        about_piece = text.startswith(scratch) or NO_REFERENCE in text
-        if about_piece:  # the input has its own message
-            continue
-        known = next((words for words in (NO_POLYGON_NEAR, NO_POINT_MATCHES) if words in text), "")
-        lines.append(text[text.index(known) :])  # without its stage
-    return lines
+def _messages(pipeline: Pipeline) -> list[Message]:
+    """Return messages of a tile; those on the files cut for it are left to the survey's inputs."""
+    messages = pipeline.log_messages
+    for message in pipeline.messages:
+        if message.topic is Topic.NOTHING_MATCHES:
+            messages.append(replace(message, place=""))
+        elif message.topic not in (Topic.INPUT, Topic.NO_REFERENCE):
+            messages.append(message)
+    return messages
 
 
 def _with_origin(

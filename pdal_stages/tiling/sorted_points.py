@@ -23,8 +23,6 @@ from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource, sum_points
 from .options import Box, TileGrid, check_number
 
-#: What messages call the copy.
-TEMPORARY = "temporary"
 #: Points that are sorted at a time, to bound memory (not tuned).
 _PART = 1_000_000
 #: The points are sorted by cells; this many make up the side of a tile. A power of two, so that
@@ -44,7 +42,7 @@ def _copy_type(layout: Layout) -> np.dtype:
 def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> CloudIndex:
     """Read a file once, write its points into a sorted copy, and return their index.
 
-    `lone_grid` is :attr:`.Survey.lone_grid`.
+    `lone_grid` is :attr:`.Survey.lone_grid`. WriteError where the copy cannot be written.
     """
     layout = Layout.of_file(path)
     dtype, cells = _copy_type(layout), grid.scaled(1 / _CELLS)
@@ -52,7 +50,7 @@ def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> 
     parts, held_squares = [np.empty((0, 4), np.int64)], [np.empty((0, 3), np.int64)]
     total = 0
     changed_ns, digest = os.stat(path).st_ctime_ns, digest_of_file(path)
-    with whole_files(target, what=TEMPORARY) as (partial,), open(partial, "wb") as out:
+    with whole_files(target, what="temporary") as (partial,), open(partial, "wb") as out:
         for records in read_records(path, layout, most=_PART):
             x, y = (layout.fields[axis].read(records) for axis in "XY")
             low = np.minimum(low, (x.min(), y.min()))

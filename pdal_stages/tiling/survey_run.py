@@ -10,14 +10,15 @@ from functools import partial
 from typing import Any, TypeVar
 
 from ..base import las_check
-from ..base.errors import StageError
+from ..base.errors import StageError, WriteError
 from ..base.hashing import fingerprint
+from ..base.messages import Message
 from ..base.progress import Progress
 from ..pipeline.workers import ThisProcess, WorkerProcesses, Workers, run_tasks
 from .inputs import CloudIndex, Survey
 from .jobs import InputJob, Job, OutputJob, Store
 from .options import TilingOptions
-from .sorted_points import TEMPORARY, sort_points
+from .sorted_points import sort_points
 
 _Job = TypeVar("_Job", bound=Job)
 #: A run stops when this many tiles failed for the same reason and none succeeded (not tuned).
@@ -62,6 +63,7 @@ class SurveyRun:
                 self.peak_mb = max(self.peak_mb, answer.cost.peak_mb)
                 if answer.reason:
                     job.fail(answer.reason)
+                    job.failure = answer.failure
                 else:
                     job.state, job.record, job.cost = "done", answer.result, answer.cost
                     with contextlib.suppress(OSError):  # no room: a later run does it again
@@ -104,13 +106,13 @@ class SurveyRun:
             return partial(sort_points, job.source.path, survey.grid, survey.lone_grid, copy)
 
         for job in self.do("reading the inputs", waiting, task_of):
-            if f"the {TEMPORARY} file" in job.reason:  # the input is not the cause
+            if job.failure is WriteError:  # the input is not the cause
                 raise StageError(job.reason)
             job.source.fault = job.reason
             job.source.index = job.record or job.source.index
             if job.record is not None and job.record.count:
                 odd = las_check.beyond_box(job.source.path, job.record.box)
-                survey.messages += [odd] if odd else []
+                survey.messages += [Message(odd)] if odd else []
         survey.place()
 
     def unkept(self, jobs: Iterable[_Job]) -> deque[_Job]:

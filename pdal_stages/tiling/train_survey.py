@@ -17,7 +17,7 @@ from ..base.files import check_outputs
 from ..base.json_types import StageJson
 from ..base.las_points import columns_of_files
 from ..base.memory import free_memory
-from ..base.messages import Report
+from ..base.messages import Message, Report, without_repeated
 from ..classifier.model import Model
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
@@ -114,7 +114,7 @@ class TrainTask:
                     "read after the other",
                 )
 
-    def run(self) -> list[str]:
+    def run(self) -> list[Message]:
         """Train and write the model; return messages."""
         base = self.stage.training.base
         if base is None:
@@ -130,9 +130,9 @@ class TrainTask:
         self._check_memory()
         model = self._train(heights, report)
         stage.finish(model, report)
-        messages = [*filter(None, [warning]), *report.messages]
+        messages = [Message(warning)] if warning else []
         # A message that the preparation has as well comes once.
-        return [text for text in messages if not any(text.endswith(f": {m}") for m in messages)]
+        return without_repeated([*messages, *report.messages])
 
     def _read(self, files: Sequence[str], heights: Sequence[StageJson]) -> Points:
         """Read the points with heights."""
@@ -150,11 +150,7 @@ class TrainTask:
             points = points_of_views(pipeline.arrays, pipeline.metadata, self.stage.points)
         if not points.count:
             raise StageError("there are no points to train on", where=", ".join(files[:3]))
-        points.report.warnings += [
-            *messages,
-            *(f"PDAL says: {line}" for line in pipeline.log_lines[:10]),
-        ]
-        points.report.warnings += pipeline.messages
+        points.report.warnings += messages + pipeline.log_messages[:10] + pipeline.messages
         return points
 
     def _train(self, heights: Sequence[StageJson], report: Report) -> Model:
