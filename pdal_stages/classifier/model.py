@@ -345,6 +345,7 @@ class Model:
             on_line = find_lines(locate(rows), shares, how.threads)
             settle_lines(prediction, rows[on_line], self.codes)
             if how.observer is not None:
+                how.observer.see_lines(candidates.probability, candidates.code)
                 how.observer.see_classes(ClassStep.LINES, prediction.classification)
         rejected = reject(prediction, wanted, current, how)
         report = Report(count_classes(prediction.classification, wanted, len(rejected)))

@@ -46,8 +46,10 @@ class Reaches:
     """
 
     first: int  #: number of the first stage that runs on points near alone
+    model: int  #: number of the stage of the model
     ground: HagMorphological | None  #: this stage, where it finds the ground in cells
     used: Sequence[float]  #: of each stage: how far its results are used
+    lines: float  #: what the model looks at among its results, where one may lie on a line
     near: float  #: what the stages from the first one on look at
     inner: float  #: within which results of the stages before it count
     around: float  #: what these look at
@@ -63,7 +65,6 @@ class Reaches:
         reaches = [stage.halo_m() for stage in stages]
         first = model = next(n for n, stage in enumerate(stages) if isinstance(stage, ApplyModel))
         blocks = ground = None
-        lines_m = sum(s.model.reach_of_lines_m for s in stages if isinstance(s, ApplyModel))
         for number, stage in enumerate(stages[:model]):
             if isinstance(stage, HagMorphological) and (blocks := stage.blocks()) is not None:
                 first, ground, reaches[number] = number, stage, 0.0
@@ -80,8 +81,8 @@ class Reaches:
             inner += ground.reach_near_m
             far += blocks.margin + blocks.reach
         around = inner + sum(reaches[:first])
-        used[model] += lines_m  # lines are found among the points that the model classifies
-        return cls(first, ground, used, near, inner, around, max(far, around))
+        lines = sum(s.model.reach_of_lines_m for s in stages if isinstance(s, ApplyModel))
+        return cls(first, model, ground, used, lines, near, inner, around, max(far, around))
 
     def limited(self, around: float, far: float) -> Reaches:
         """Return these where points farther away count as far, or, the other limit, not at all."""
@@ -116,9 +117,14 @@ class Recording(Observer):
     steps: dict[ClassStep, tuple[NDArray[np.uint8], NDArray[np.float32] | None]] = field(
         default_factory=dict
     )
+    #: (m,) probability and class of lines, where the model has these
+    lines: tuple[NDArray[np.float32], NDArray[np.uint8]] | None = None
     #: (m,) dimensions after all stages
     results: Mapping[str, NDArray] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    #: which points (n,) have classes that are used, and whether some of these may be lines
+    _used: NDArray[np.bool_] = field(init=False)
+    _may_be_lines: bool = False
 
     def run(self, pipeline: Pipeline, reaches: Reaches, far: Sequence[NDArray[np.float64]]) -> None:
         """Run the stages: the first ones on all points, those after them on points near.
@@ -155,14 +161,24 @@ class Recording(Observer):
         xy = np.column_stack([self.cloud[axis] for axis in "XY"])
         outside = unit * cKDTree(xy[self.rows]).query(xy, p=np.inf)[0]
         outside[self.rows] = -1.0
-        for each, used_m in zip(ours, reaches.used, strict=True):
-            each.update_context(outside=_OUTSIDE, used_m=used_m)
         known = {name: values[near] for name, values in seen.maps[0].items()}
         known[_OUTSIDE] = outside
-        seen = run_stages(ours[reaches.first :], self.cloud, wkt, known, self._keep_classes)
+        before, after = ours[reaches.first : reaches.model], ours[reaches.model :]
+        known = {**run_stages(before, self.cloud, wkt, known, self._keep_classes).maps[0]}
+        self._used = outside <= reaches.used[reaches.model]
+        for each, used_m in zip(ours, reaches.used, strict=True):
+            each.update_context(outside=_OUTSIDE, used_m=used_m)
+        seen = run_stages(after, self.cloud, wkt, known, self._keep_classes)
+        if self._may_be_lines:
+            # Of lines all points around are needed, which few places are worth.
+            self.inputs.clear()
+            del self.stages[reaches.model :], self.classes[reaches.model :]
+            after[0].update_context(used_m=reaches.used[reaches.model] + reaches.lines)
+            seen = run_stages(after, self.cloud, wkt, known, self._keep_classes)
         self.results = SomeRows(seen, self.rows)
-        messages = [*pipeline.expanded.warnings, *pipeline.messages]
-        self.notes = [str(each) for each in messages if each.topic is not Topic.OTHER_DENSITY]
+        texts = [*pipeline.expanded.warnings, *pipeline.messages]
+        told = (str(each) for each in texts if each.topic is not Topic.OTHER_DENSITY)
+        self.notes = [*dict.fromkeys(told)]
 
     def _box(self, reach: float) -> Box:
         """Return the box of the points in question, wider by a reach in units of coordinates."""
@@ -203,6 +219,11 @@ class Recording(Observer):
         """Keep classes after a step of the model's stage."""
         limit = None if least is None else least[self.rows_seen]
         self.steps[step] = codes[self.rows_seen], limit
+
+    def see_lines(self, probability: NDArray[np.float32], codes: NDArray[np.uint8]) -> None:
+        """Keep which points may be lines."""
+        self.lines = probability[self.rows_seen], codes[self.rows_seen]
+        self._may_be_lines = bool(probability[self._used].any())
 
 
 def ground_candidates(
