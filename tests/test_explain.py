@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import laspy
 import numpy as np
@@ -14,7 +15,10 @@ from pdal_stages.base.errors import StageError
 from pdal_stages.base.las_points import columns_of_files
 from pdal_stages.classifier.training_percentiles import PERCENTILES
 from pdal_stages.cli import main
-from pdal_stages.review.explanation import AskedPlace
+from pdal_stages.pipeline.classify_request import ClassifyRequest
+from pdal_stages.review.explain import explain_points
+from pdal_stages.review.explanation import AskedPlace, LineTrace, Noise, StepAfter
+from pdal_stages.review.explanation_text import _applies, _Fields, _tables, lines
 from pdal_stages.review.places import read_places
 from pdal_stages.review.points_around import read_around
 from pdal_stages.review.trace_points import SURROUNDINGS, share_below
@@ -114,6 +118,24 @@ def test_against_names_the_class_that_is_compared(city, explain):
     _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 6)[:1])
     text, (each,) = explain(city, *places[0], "--against", "2")
     assert each["verdict"]["rival"] == 2 and "For Building, against Ground" in text
+
+
+def test_what_may_lie_on_a_line_is_told_and_every_row_can_be_filled(city):
+    _, places = places_of(city, np.flatnonzero(laspy.read(city).classification == 5)[:1])
+    (told,) = explain_points([str(city)], [AskedPlace(*places[0])], ClassifyRequest())
+    for is_on_line, text in (
+        (True, "0.08 for 14 Wire - conductor (phase), and it lies on a line of such points"),
+        (False, "but it lies on no line of such points: it is 5 High vegetation"),
+    ):
+        trace = LineTrace(0.08, 14, is_on_line, 14 if is_on_line else 5)
+        seen = replace(told, verdict=replace(told.verdict, lines=trace))
+        assert sum(text in line for line in lines(seen)) == 1
+        assert max(map(len, lines(seen)[1:])) <= 120
+    records = [seen, Noise(7, "loose"), seen.ground, seen.verdict, StepAfter("towers", 15, False)]
+    tables = zip(("head differs", "noise", "ground", "model", "after"), records, strict=True)
+    for names, record in tables:
+        for condition, text in ((c, t) for n in names.split() for _, c, t in _tables()[n]):
+            assert _applies(condition, record) in (True, False) and _Fields().format(text, record)
 
 
 # ---- planted errors ------------------------------------------------------------------------------

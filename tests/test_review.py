@@ -146,7 +146,7 @@ def test_the_command_lists_where_a_model_was_unsure(folder, tmp_path, run):
 
 @pytest.mark.pdal
 def test_what_speaks_against_the_worst_patches_is_named(folder, tmp_path, run):
-    """Of as many patches as asked for, two inputs each, in words and in the vector file."""
+    """Two inputs of each, in words and in the vector file; of as many patches as asked for."""
     pytest.importorskip("pyogrio")
     out = tmp_path / "review.gpkg"
     words = ["review", folder / "whole.laz", out, "--json", tmp_path / "r.json", "--reasons"]
@@ -161,6 +161,11 @@ def test_what_speaks_against_the_worst_patches_is_named(folder, tmp_path, run):
         column = base.execute("SELECT against FROM patches ORDER BY fid").fetchall()
     assert [text or "" for (text,) in column] == named[: len(column)]
     assert "against it" not in run(*words, 0)[1]
+    code, _, err = run(*words[:-1])
+    assert code == 0, err
+    worst = json.loads((tmp_path / "r.json").read_text())["worst"]
+    assert [row["against"] for row in worst[:3]] == named[:3]
+    assert np.mean([bool(row["against"]) for row in worst]) > 0.8
     code, _, err = run(*words, 3, "--model", Path(__file__).parent / "data" / "frozen-3.model")
     assert code == 0, err
 

@@ -88,9 +88,7 @@ class ModelObserver(Protocol):
     ) -> None:
         """Receive the classes (n,) after a step, and the least reliability (n,) that keeps them."""
 
-    def see_lines(
-        self, probability: npt.NDArray[np.float32], codes: npt.NDArray[np.uint8]
-    ) -> None:
+    def see_lines(self, probability: npt.NDArray[np.float32], codes: npt.NDArray[np.uint8]) -> None:
         """Receive the probability (n,) of classes of lines, before lines are found, and the class.
 
         Both are 0 of points that are no candidates.

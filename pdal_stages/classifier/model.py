@@ -102,6 +102,14 @@ class Model:
         return list(map(WeightedPass, self.passes, self.codes_of, factors))
 
     @property
+    def first_pass(self) -> Model:
+        """A model of the first pass alone, with its classes as they are, and no lines."""
+        names = dict(self.classes)
+        classes = [(code, names.get(code, str(code))) for code in self.codes_of[0]]
+        changed = {"passes": self.info["passes"][:1], "priors": None, "lines": []}
+        return Model(self.passes[:1], classes, cast(ModelInfo, {**self.info, **changed}))
+
+    @property
     def required_dimensions(self) -> tuple[str, ...]:
         """Dimensions that a cloud must have beside its coordinates."""
         return required_dimensions(self.plan.dimensions)

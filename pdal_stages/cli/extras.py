@@ -38,8 +38,8 @@ def add_commands(parser: Parser) -> None:
     cell = "Side of the cells (default: by density)"
     add("--cell", type=float, default=0.0, metavar="METERS", help=cell)
     add("--workers", type=int, default=1, metavar="N", help=_WORKERS)
-    reasons = "Name what speaks against the class of the worst N patches (10; 0: none)"
-    add("--reasons", type=int, default=10, metavar="N", help=reasons)
+    reasons = "Name what speaks against the class of the worst N patches only (all; 0: of none)"
+    add("--reasons", type=int, metavar="N", help=reasons)
     model = "Model for files without Reliability, and for --reasons (standard)"
     add("--model", default="standard", help=model)
 

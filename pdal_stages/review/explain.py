@@ -43,7 +43,6 @@ def explain_points(
     inputs: Sequence[str],
     places: Sequence[AskedPlace],
     request: ClassifyRequest,
-    reach_m: float = math.inf,
     against: int | None = None,
 ) -> list[Explanation]:
     """Explain the points nearest to places.
@@ -56,8 +55,6 @@ def explain_points(
         In the reference system of the files.
     request : ClassifyRequest
         How the points are classified.
-    reach_m : float
-        Points farther away are not read, though the stages may look farther: for hints.
     against : int, optional
         Class of the model that the one found is compared with; by default the class of the file,
         where the model has it and finds another one, else the one that is next likely.
@@ -75,7 +72,7 @@ def explain_points(
     check_one_reference(references)
     exact = {**request.classifier_options, "compact": False}
     request = replace(request, dimensions=("Probability_",), classifier_options=exact)
-    cloud = _Cloud(files, references[files[0]], request, reach_m, against)
+    cloud = _Cloud(files, references[files[0]], request, against)
     out: dict[int, Explanation] = {}
     for members in cloud.squares(places):
         recording, away = cloud.record([places[number] for number in members])
@@ -91,7 +88,6 @@ class _Cloud:
     files: Sequence[str]
     reference: Reference
     request: ClassifyRequest
-    reach_m: float
     against: int | None
 
     @cached_property
@@ -118,7 +114,7 @@ class _Cloud:
         needed = Reaches.of_stages(stages, is_classified)
         xy = np.array([place[:2] for place in places])
         fitting = unit * _reach_that_fits(self.headers, xy, needed.around / unit)
-        reaches = needed.limited(min(fitting, self.reach_m), self.reach_m)
+        reaches = needed.limited(fitting)
         far: list[NDArray[np.float64]] = [np.empty((0, 3))]
 
         def reduce(columns: LasColumns) -> None:

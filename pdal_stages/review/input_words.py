@@ -52,3 +52,9 @@ def words_for(name: str) -> tuple[str, str]:
             if where.startswith(head) and size.replace(".", "").isdecimal():
                 return f"{words}, {text.format(size)}", unit
     return f"{words}, {where}" if where else words, unit
+
+
+def show_value(name: str, value: float) -> str:
+    """Return the value of an input with its unit."""
+    value = 0.0 if abs(value) < 5e-4 else value
+    return f"{value:.3g} {words_for(name)[1]}".rstrip()

@@ -83,13 +83,9 @@ class FilePoints(LazyColumns):
             rows = rows if len(rows) else np.arange(len(x))
             xyz = unit * np.column_stack([self[axis][rows] for axis in "XYZ"])
             away = np.sqrt(((xyz[:, : len(target)] - unit * target) ** 2).sum(axis=1))
-            inside = np.flatnonzero(away <= place.doubtful_m)
-            if len(inside) and "Reliability" in self:
-                least = int(inside[np.argmin(self["Reliability"][rows[inside]])])
-                return int(rows[least]), float(away[least])
             least, near = int(np.argmin(away)), away < _SPACING_M
             spacing = 1.0 / np.sqrt(density(xyz[near])) if near.any() else 0.0
-            if away[least] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing, place.doubtful_m):
+            if away[least] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing):
                 return int(rows[least]), float(away[least])
             reason = f"the nearest is {away[least]:.1f} m away"
             flat = np.hypot(x[rows], y[rows])

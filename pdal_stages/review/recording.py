@@ -84,12 +84,12 @@ class Reaches:
         lines = sum(s.model.reach_of_lines_m for s in stages if isinstance(s, ApplyModel))
         return cls(first, model, ground, used, lines, near, inner, around, max(far, around))
 
-    def limited(self, around: float, far: float) -> Reaches:
-        """Return these where points farther away count as far, or, the other limit, not at all."""
-        around, far = min(self.around, around), min(self.far, far)
+    def limited(self, limit: float) -> Reaches:
+        """Return these where points farther away than a limit count as far."""
+        around = min(self.around, limit)
         inner = min(around, max(self.near, around - (self.around - self.inner)))
-        far = far if self.ground is not None else around
-        return replace(self, inner=inner, around=around, far=max(around, far))
+        far = self.far if self.ground is not None else around
+        return replace(self, inner=inner, around=around, far=far)
 
 
 #: What each step of the ground filter made of a piece of the cloud, by its name.

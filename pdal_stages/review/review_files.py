@@ -6,7 +6,7 @@ A review becomes vector layers with styles for QGIS, JSON and lines of text.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from ..reports.vector_files import Layer, check_target, qml, write_layers
 from ..stages.points import Points
 from .doubts import inputs_against
 from .expected_errors import Patches, ReviewCells, cell_side, find_patches
-from .explanation import AskedPlace
 
 #: Dimensions that are read where they exist.
 DIMENSIONS = ("Reliability", "ReturnNumber", "NumberOfReturns")
@@ -61,7 +60,9 @@ class Review:
     listed: int
     files: list[str]
     unit: float = 1.0  #: of the files' coordinates, in which places are reported, meters
-    against: Sequence[str] = ()  #: by patch, as far as known, what speaks against its class
+    against: list[str] = field(
+        default_factory=list
+    )  #: by patch, as far as known, what speaks against its class
 
     @cached_property
     def tiles(self) -> list[JsonObject]:
@@ -260,29 +261,50 @@ def compute_reliability(points: Mapping[str, NDArray], model_name: str) -> NDArr
 
 
 def write_review(
-    inputs: Sequence[str], output: str, json_file: str = "", reasons: int = 0, **options: Any
+    inputs: Sequence[str],
+    output: str,
+    json_file: str = "",
+    reasons: int | None = None,
+    **options: Any,
 ) -> Review:
     """Review files, and write a vector file and, where named, a JSON file.
 
-    For the first patches, `reasons` of them, the inputs of the model that speak most against their
-    class are named. `options` are those of :func:`review_files`.
+    For the first patches, `reasons` of them or all, the inputs of the model that speak most against
+    their class are named. `options` are those of :func:`review_files`.
     """
     check_target(output, LAYERS)
     outputs = [Output(output, "review")] + [Output(json_file, "json", JSON)] * bool(json_file)
     check_outputs(outputs, [*input_files(inputs), *inputs, find(options.get("model", STANDARD))])
     review = review_files(inputs, **options)
-    middles = review.patches.at[: min(reasons, review.listed)] / review.unit
-    side = review.cells.side
-    places = [AskedPlace(x, y, doubtful_m=side) for x, y in middles.tolist()]
-    if places:
-        model = options.get("model", STANDARD)
-        review.against = inputs_against(review.files, places, model)
+    count = review.listed if reasons is None else min(reasons, review.listed)
+    review.against = [""] * count
+    for number in np.unique(review.patches.file[:count]).tolist():
+        name_doubts(review, number, options.get("model", STANDARD))
     layers = review_layers(review)
     wkt = reference_of_file(review.files[0]).wkt
     write_layers(output, layers, wkt, styles(review.patches.errors))
     if json_file:
         write_json(json_file, review.to_dict(), "json")
     return review
+
+
+def name_doubts(review: Review, number: int, model: str) -> None:
+    """Name what speaks against the class of the patches of a file; its number is among the files.
+
+    Where nothing can be told, a message says why.
+    """
+    rows = np.flatnonzero(review.patches.file[: len(review.against)] == number)
+    path = review.files[number]
+    try:
+        parts = [*read_points(path, reference_of_file(path).wkt)]
+        points = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        points.setdefault("Reliability", np.zeros(len(points["codes"])))
+        places, side = review.patches.at[rows], review.cells.side
+        texts = inputs_against(points, places, side, loaded_model(model))
+        for row, text in zip(rows.tolist(), texts, strict=True):
+            review.against[row] = text
+    except StageError as error:
+        print_messages(f"what speaks against the classes in {path} is not known: {error}")
 
 
 def review_layers(review: Review) -> dict[str, Layer]:

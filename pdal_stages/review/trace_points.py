@@ -17,14 +17,18 @@ from ..stages.apply_model import ApplyModel
 from ..stages.base import Kept
 from ..stages.detached_noise import DetachedNoise
 from ..stages.hag_morphological import HagMorphological
+from ..terrain.detached import HEAVY, HELD, LOOSE, SOLID, UNJUDGED
 from ..terrain.heights import JUDGED, PLACED
 from .explanation import (
+    TOWERS,
     Explanation,
     FoundPoint,
     GroundSteps,
+    LineTrace,
     Noise,
     PassInput,
     PassTrace,
+    StepAfter,
     Verdict,
 )
 from .recording import Recording
@@ -38,6 +42,14 @@ _LOWER_M = 1.0
 #: Dimensions that are compared with those of the file, and the steps to which `classify` rounds
 #: them.
 _COMPARED = {"HeightAboveGround": 1 / 32, "Reliability": 1 / 64}
+#: Names of states of noise.
+_STATES = {SOLID: "solid", HELD: "held", LOOSE: "loose", HEAVY: "heavy", UNJUDGED: "unjudged"}
+#: Stages after the model by the options that run them.
+_OPTIONS = {
+    "filters.towers": TOWERS,
+    "filters.bridges": "--bridges",
+    "filters.polygons": "--polygons",
+}
 
 
 def trace_point(
@@ -47,39 +59,49 @@ def trace_point(
 
     `against` is the class that the one found is compared with, if the model has both.
     """
-    columns, row = recording.cloud, int(recording.rows[place])
-    codes = [int(columns["Classification"][row]), *(int(c[place]) for c in recording.classes)]
-    after = {type(stage): code for stage, code in zip(recording.stages, codes[1:], strict=True)}
-    model_at = next(n for n, s in enumerate(recording.stages) if isinstance(s, ApplyModel))
-    kept = _why_kept(recording, place, codes[model_at])
-    verdict: Verdict | None = None
-    steps: list[tuple[str, int]] = []
+    cloud, row = recording.cloud, int(recording.rows[place])
+    codes = [int(cloud["Classification"][row]), *(int(c[place]) for c in recording.classes)]
+    stages = recording.stages
+    model_at = next(n for n, stage in enumerate(stages) if isinstance(stage, ApplyModel))
+    kept, before, verdict, same = _why_kept(recording, place, codes[model_at]), codes[0], None, {}
+    steps = [
+        (_OPTIONS.get(stage.type, stage.type), code)
+        for stage, code in zip(stages[model_at + 1 :], codes[model_at + 2 :], strict=True)
+    ]
     compared: dict[str, tuple[float, float, bool]] = {}
     if not kept:
         verdict = _verdict(recording, place, against or codes[0])
-        steps = _steps_of_model(recording, place)
+        steps, before = [*_steps_of_model(recording, place), *steps], verdict.winner
         for name, step in _COMPARED.items():
-            if name in columns and name in recording.results:
-                before, now = float(columns[name][row]), float(recording.results[name][place])
-                compared[name] = before, now, abs(before - now) <= 0.51 * step + 1e-4
-    later = zip(recording.stages[model_at + 1 :], codes[model_at + 2 :], strict=True)
-    noise = None
-    if len(recording.noise):
-        code = after[DetachedNoise]
-        noise = Noise(code if code != codes[0] else 0, int(recording.noise[place]))
-    point = _point(recording, row, distance_m)
+            if name in cloud and name in recording.results:
+                was, now = float(cloud[name][row]), float(recording.results[name][place])
+                same[name] = abs(was - now) <= 0.51 * step + 1e-4
+                compared[name] = was, now, same[name]
+    classes = [before, *(code for _, code in steps)]
     return Explanation(
-        point,
-        codes[0],
-        codes[-1],
-        kept,
-        noise,
-        _ground(recording, place),
-        verdict,
-        [*steps, *((stage.type, code) for stage, code in later)],
-        compared,
-        recording.notes,
+        point=_point(recording, row, distance_m),
+        in_file=codes[0],
+        computed=codes[-1],
+        kept=kept,
+        noise=_noise(recording, place, codes),
+        ground=_ground(recording, place),
+        verdict=verdict,
+        steps=[StepAfter(*s, s[1] == code) for s, code in zip(steps, classes, strict=False)],
+        compared=compared,
+        has_other_ground=not same.get("HeightAboveGround", True),
+        has_other_model=not same.get("Reliability", True),
+        is_changed=codes[0] != codes[-1] and len(same) == 2 and all(same.values()),
+        notes=recording.notes,
     )
+
+
+def _noise(recording: Recording, place: int, codes: Sequence[int]) -> Noise | None:
+    """Return whether a point is noise; `codes` are its class in the file and after each stage."""
+    if not len(recording.noise):
+        return None
+    at = next(n for n, each in enumerate(recording.stages, 1) if isinstance(each, DetachedNoise))
+    code = codes[at] if codes[at] != codes[0] else 0
+    return Noise(code, _STATES[int(recording.noise[place])])
 
 
 def _point(recording: Recording, row: int, distance_m: float) -> FoundPoint:
@@ -113,8 +135,8 @@ def _ground(recording: Recording, place: int) -> GroundSteps | None:
     stage = next(s for s in recording.stages if isinstance(s, HagMorphological))
     number, column, line = (heights[name] for name in PLACED)
     piece, cell = recording.pieces[number], stage.cell
-    columns, row, units = recording.cloud, recording.rows[place], recording.reference.units
-    z = float(columns["Z"][row]) * units.vertical
+    cloud, row, units = recording.cloud, recording.rows[place], recording.reference.units
+    z = float(cloud["Z"][row]) * units.vertical
 
     def elevation(step: str, cells: int = 0) -> float | None:
         """Return what a step made of the cell, or the least of those around, above the point."""
@@ -126,28 +148,41 @@ def _ground(recording: Recording, place: int) -> GroundSteps | None:
         known = part[np.isfinite(part)]
         return float(known.min()) - z if len(known) else None
 
-    away_x = (columns["X"] - columns["X"][row]) * units.horizontal
-    strip = np.flatnonzero(np.abs(away_x) <= _NEAR_M)
-    away_y = (columns["Y"][strip] - columns["Y"][row]) * units.horizontal
-    near = strip[np.hypot(away_x[strip], away_y) <= _NEAR_M]
-    lower = columns["Z"][near] * units.vertical < z - _LOWER_M
+    away = (units.horizontal * (cloud[axis] - cloud[axis][row]) for axis in "XY")
+    near = np.hypot(*away) <= _NEAR_M
+    count = int(np.count_nonzero(near))
+    lower = int(np.count_nonzero(cloud["Z"][near] * units.vertical < z - _LOWER_M))
+    lowest = elevation("low_outliers" if "low_outliers" in piece else "minimum_grid")
+    floor, land = elevation("openings"), elevation("wide_roofs")
+    lowest_near, given = elevation("low_outliers", round(_NEAR_M / cell)), elevation("given_ground")
+    rounds = [elevation(name) is not None for name in piece if name.startswith("round_")]
+    lowered = 0.0 if lowest is None or floor is None else lowest - floor
+    roof = 0.0 if floor is None or land is None else floor - land
     return GroundSteps(
-        cell,
-        2 * stage.options["window"] + cell,
-        elevation("low_outliers" if "low_outliers" in piece else "minimum_grid"),
-        elevation("openings"),
-        elevation("wide_roofs"),
-        [elevation(name) is not None for name in piece if name.startswith("round_")],
-        elevation("given_ground"),
-        elevation("low_outliers", round(_NEAR_M / cell)),
-        len(near),
-        int(np.count_nonzero(lower)),
-        stage.given_ground,
-        heights["HeightAboveGround"],
-        heights[JUDGED[0]],
-        heights[JUDGED[1]],
-        bool(heights["Ground"]),
-        {width: heights[opening(width).name] for width in stage.openings},
+        cell=cell,
+        window=2 * stage.options["window"] + cell,
+        lowest=lowest,
+        floor=floor,
+        land=land,
+        lowered=lowered,
+        roof=roof,
+        rounds=rounds,
+        regained=rounds.index(True) + 1 if any(rounds) else 0,
+        has_steps=lowest is not None and not stage.given_ground,
+        is_object=lowered > 0 or roof > 0,
+        is_given=stage.given_ground,
+        given=given,
+        lowest_near=lowest_near,
+        raised=0.0 if given is None else given - (lowest_near or 0.0),
+        near=count,
+        lower=lower,
+        lower_share=lower / count,
+        has_noise=not len(recording.noise),
+        height=heights["HeightAboveGround"],
+        above_provisional=heights[JUDGED[0]],
+        tolerance=heights[JUDGED[1]],
+        is_ground=bool(heights["Ground"]),
+        openings={width: heights[opening(width).name] for width in stage.openings},
     )
 
 
@@ -161,26 +196,32 @@ def _model_stage(recording: Recording) -> ApplyModel:
 
 def _verdict(recording: Recording, place: int, against: int) -> Verdict:
     """Return what the model said of a point; `against` is the rival, if it can be."""
-    stage = _model_stage(recording)
+    stage, units = _model_stage(recording), recording.reference.units
     model, names = stage.model, dict(stage.model.classes)
-    at, units = recording.rows_seen[place], recording.reference.units
     shares = {code: float(recording.results[f"Probability_{code}"][place]) for code in names}
-    winner = int(recording.steps[ClassStep.LIKELIEST][0][place])
+    winner, lines = int(recording.steps[ClassStep.LIKELIEST][0][place]), None
+    if recording.lines is not None and (share := float(recording.lines[0][place])):
+        became = int(recording.steps[ClassStep.LINES][0][place])
+        is_on_line = bool(model.lines[model.codes == became].any())
+        lines = LineTrace(share, int(recording.lines[1][place]), is_on_line, became)
+        winner = became if is_on_line else winner
     others = [code for code in names if code != winner]
     rival = against if against in others else max(others, key=lambda code: shares[code])
     by_pass: dict[int, PassTrace] = {}
     stands = None
     for each in recording.inputs:
-        if each.number not in by_pass and (rows := np.flatnonzero(each.rows == at)).size:
+        rows = np.flatnonzero(each.rows == recording.rows_seen[place])
+        if each.number not in by_pass and rows.size:
             by_pass[each.number] = _trace_pass(model, each, int(rows[0]))
             xyz = [recording.cloud[axis][recording.rows[place]] for axis in "XYZ"]
             meters = np.array(xyz) * [units.horizontal, units.horizontal, units.vertical]
             away = float(np.linalg.norm(each.xyz[rows[0]] - meters))
             stands = away if away > 1e-5 else None
     passes = [by_pass[number] for number in sorted(by_pass)]
-    last = passes[-1].probabilities if passes else {}
-    lost = [code for code in last if last[code] == max(last.values()) and not shares[code]]
-    return Verdict(stage.model_file, names, shares, winner, rival, passes, stands, lost)
+    has_reasons = bool(passes and passes[0].start)
+    return Verdict(
+        stage.model_file, names, shares, winner, rival, passes, has_reasons, stands, lines
+    )
 
 
 def _trace_pass(model: Model, read: PassInputs, at: int) -> PassTrace:
@@ -191,11 +232,9 @@ def _trace_pass(model: Model, read: PassInputs, at: int) -> PassTrace:
         return dict(zip(model.codes_of[read.number], values.tolist(), strict=True))
 
     probabilities = by_class(read.probabilities[at])
-    if not isinstance(single, FeatureForest):
-        return PassTrace(probabilities, {}, [])
     values = read.values[at : at + 1]
-    contributions = single.contributions(values)
-    if contributions is None:
+    contributions = single.contributions(values) if isinstance(single, FeatureForest) else None
+    if not isinstance(single, FeatureForest) or contributions is None:
         return PassTrace(probabilities, {}, [])
     start, added = contributions
     names, ranges = single.plan.names, _percentiles(model, read.number)
@@ -233,18 +272,16 @@ def share_below(value: float, percentiles: Sequence[float]) -> float:
 
 def _steps_of_model(recording: Recording, place: int) -> list[tuple[str, int]]:
     """Return what the model's stage did after the verdict, and the class after each step."""
-    heights = _model_stage(recording).vegetation_heights
-    texts = {
-        ClassStep.GIVEN_GROUND: "--ground given",
-        ClassStep.HEIGHTS: f"--vegetation-heights {','.join(f'{height:g}' for height in heights)}",
-    }
-    steps = []
-    if recording.steps[ClassStep.LIKELIEST][0][place] != GROUND:
-        del texts[ClassStep.GIVEN_GROUND]
-    for step, (codes, least) in recording.steps.items():
+    heights = ",".join(f"{height:g}" for height in _model_stage(recording).vegetation_heights)
+    names = {ClassStep.HEIGHTS: f"--vegetation-heights {heights}"}
+    if recording.steps[ClassStep.LIKELIEST][0][place] == GROUND:
+        names[ClassStep.GIVEN_GROUND] = "--ground given"
+    for step, (_, least) in recording.steps.items():
         if least is not None:
             limit = f"from a probability of {least[place]:.2f} on"
-            texts[step] = f"--keep-sure ({limit if least[place] else 'no limit for it'})"
-        if step in texts:
-            steps.append((texts[step], int(codes[place])))
-    return steps
+            names[step] = f"--keep-sure ({limit if least[place] else 'no limit for it'})"
+    return [
+        (names[step], int(codes[place]))
+        for step, (codes, _) in recording.steps.items()
+        if step in names
+    ]
