@@ -87,6 +87,17 @@ def describe_wires(scores: dict[str, list[dict[str, Any]]]) -> str:
             rows.append((title, name, strips))
     for row in scores["strands"]:
         rows.append((f"single strands hung over {row['survey']}", "wire", [row]))
+    for title, each in {
+        "single conductors": [row for row in scores["lines"] if row["conductors"] == 1],
+        "two to four, 0.2 to 0.5 m apart": [
+            row for row in scores["lines"] if row["close"] and row["conductors"] <= 4
+        ],
+        "three, 0.8 to 2.5 m apart": [
+            row for row in scores["lines"] if row["conductors"] == 3 and not row["close"]
+        ],
+        "fourteen": [row for row in scores["lines"] if row["conductors"] > 4],
+    }.items():
+        rows.append((f"wires of lines set into others: {title}", "wire", each))
     for landscape in dict.fromkeys(row["landscape"] for row in scores["lines"] if row["tower"]):
         each = [row for row in scores["lines"] if row["landscape"] == landscape]
         wires = sum(row.get("tower beside", 0) for row in each)

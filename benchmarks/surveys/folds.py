@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from lines import labeled_line
-from recipe import OPTIONS, priors, strip_of, training_clouds
+from recipe import OPTIONS, strip_of, training_clouds
 from surveys import GROUPS, LINE_SURVEY, SURVEYS, TOWER, WIRE
 
 from pdal_stages import Model, TrainingCloud
@@ -131,7 +131,7 @@ class GroupsLeftOut:
         # The shipped model is of the same make; its counts of samples are replaced.
         info = {**copy.deepcopy(load_model("standard").info), "training": self._training(kept)}
         info["passes"] = [{"importances": None}] * len(passes)
-        info |= {"priors": priors(self.codes), "lines": list(OPTIONS.lines)}
+        info["lines"] = list(OPTIONS.lines)
         counts = {"available": 0, "samples": 0, "duplicates": 0}
         info["classes"] = [
             {"code": code, "name": name, "labels": [code], **counts} for code, name in self.classes

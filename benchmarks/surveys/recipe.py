@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -51,8 +50,6 @@ SHRUB_SAMPLES = 250
 #: The same of wires and of towers: as many as these are of each class, with those of others 40,000,
 #: keep false wires rare (docs/trials.md).
 WIRE_SAMPLES, TOWER_SAMPLES = 30, 6
-#: What the probability of wires is multiplied by (docs/trials.md).
-FACTORS = {WIRE: 0.7}
 #: Points per square meter of the thinnest copies that have these: in thinner ones a wire is a few
 #: points that could be anything.
 LINE_DENSITY = 1.5
@@ -259,10 +256,4 @@ def train_on(data: Path, surveys: Iterable[str], options: TrainingOptions = OPTI
     """Return the model of these surveys."""
     model = train([one for name in surveys for one in training_clouds(data, name)], options)
     model.record_preprocessing(PREPARATION)
-    model.info["priors"] = priors(model.codes.tolist())
     return model
-
-
-def priors(codes: Iterable[int]) -> dict[str, Any]:
-    """Return what a manifest says of the classes' factors."""
-    return {"weight": 0.0, "factors": [FACTORS.get(code, 1.0) for code in codes]}

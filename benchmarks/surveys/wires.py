@@ -27,6 +27,7 @@ from folds import STRIP_OF_GROUP
 from lines import STRIPS, LabeledLine, arrange, hang_strands, labeled_line, string_line
 from recipe import set_in
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 from surveys import FOREST, GROUND, LINE_SURVEY, SLOPE, SURVEYS, TOWER, WIRE
 
 from pdal_stages.classifier.model import Model, load_model
@@ -54,6 +55,8 @@ LINE_DENSITIES = (7.0, 2.0)
 LINES = (1000, 1001, 1002)
 #: Meters from a line within which points are classified.
 NEAR_LINE = 40.0
+#: Meters between conductors of lines of low voltage, at most.
+CLOSE = 0.6
 #: Label of noise of the crops.
 NOISE = 7
 
@@ -172,10 +175,12 @@ def lines_set_in(data: Path, models: Path) -> list[dict[str, Any]]:
                 continue
             for number in LINES:
                 seed = (crc32(name.encode()), number)
-                if arrange(line, np.random.default_rng(list(seed))).tower:
-                    row = line_set_in(cloud, line, strip, seed, model)
-                    out.append({"landscape": survey.landscape, "density": density, **row})
-                    print(out[-1], flush=True)
+                places = arrange(line, np.random.default_rng(list(seed))).conductors
+                apart = pdist(places).min() if len(places) > 1 else np.inf
+                row = line_set_in(cloud, line, strip, seed, model)
+                kind = {"conductors": len(places), "close": bool(apart < CLOSE)}
+                out.append({"landscape": survey.landscape, "density": density, **kind, **row})
+                print(out[-1], flush=True)
     return out
 
 
