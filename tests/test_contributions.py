@@ -8,6 +8,7 @@ from test_classifier_training import scene
 from test_refinement import on_top
 
 from pdal_stages import TrainingCloud, TrainingOptions, train
+from pdal_stages.classifier.interface import ModelObserver
 from pdal_stages.classifier.random_forest import grow_forest
 
 
@@ -59,7 +60,7 @@ def observed():
         where, seen = np.zeros(len(xyz), bool), {}
         where[[5, 77, 1234, 3001]] = True
 
-        class Observer:
+        class Observer(ModelObserver):
             def see_inputs(self, inputs):
                 if len(inputs.rows):
                     seen.setdefault(inputs.number, []).append(inputs)

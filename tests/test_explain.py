@@ -12,16 +12,17 @@ from alsnet_scenes import model_of, random_net
 from pdal_stages import load_model
 from pdal_stages.base.asprs import class_name
 from pdal_stages.base.errors import StageError
+from pdal_stages.base.las_boxes import read_around
 from pdal_stages.base.las_points import columns_of_files
-from pdal_stages.classifier.training_percentiles import PERCENTILES
+from pdal_stages.classifier.training_percentiles import PERCENTILES, share_below
 from pdal_stages.cli import main
 from pdal_stages.pipeline.classify_request import ClassifyRequest
 from pdal_stages.review.explain import explain_points
-from pdal_stages.review.explanation import AskedPlace, LineTrace, Noise, StepAfter
-from pdal_stages.review.explanation_text import _applies, _Fields, _tables, lines
-from pdal_stages.review.places import read_places
-from pdal_stages.review.points_around import read_around
-from pdal_stages.review.trace_points import SURROUNDINGS, share_below
+from pdal_stages.review.explanation import LineTrace, Noise, StepAfter
+from pdal_stages.review.explanation_text import lines
+from pdal_stages.review.places import AskedPlace, read_places
+from pdal_stages.review.trace_points import SURROUNDINGS
+from pdal_stages.review.words import _applies, _Fields, _words, words_for
 from pdal_stages.terrain.heights import filtered_ground
 
 pytestmark = pytest.mark.pdal
@@ -134,8 +135,10 @@ def test_what_may_lie_on_a_line_is_told_and_every_row_can_be_filled(city):
     records = [seen, Noise(7, "loose"), seen.ground, seen.verdict, StepAfter("towers", 15, False)]
     tables = zip(("head differs", "noise", "ground", "model", "after"), records, strict=True)
     for names, record in tables:
-        for condition, text in ((c, t) for n in names.split() for _, c, t in _tables()[n]):
+        for _, condition, text in (row for name in names.split() for row in _words()["rows"][name]):
             assert _applies(condition, record) in (True, False) and _Fields().format(text, record)
+    known = load_model("standard").passes[0].plan.names
+    assert all(words_for(name)[0] != name and "_" not in words_for(name)[0] for name in known)
 
 
 # ---- planted errors ------------------------------------------------------------------------------

@@ -74,8 +74,8 @@ class ClassStep(Enum):
     HEIGHTS = 5  #: low and medium vegetation
 
 
-class ModelObserver(Protocol):
-    """Receives how points of a cloud come to their class."""
+class ModelObserver:
+    """Receives how points of a cloud come to their class; what it does not override is dropped."""
 
     def see_inputs(self, inputs: PassInputs) -> None:
         """Receive what a pass read of points to classify."""

@@ -45,3 +45,18 @@ def percentiles_by_class(
             row = np.percentile(values[rows, column], PERCENTILES, method="nearest")
             table[name][str(code)] = [float(f"{value:.4g}") for value in row]
     return table if len(json.dumps(table)) < LIMIT_BYTES else None
+
+
+def share_below(value: float, percentiles: Sequence[float]) -> float:
+    """Return the share of training samples with lower values, by :data:`PERCENTILES`.
+
+    Of values that many samples have it is the middle of their shares.
+    """
+    known = np.array([-np.inf, *percentiles, np.inf])
+    shares = np.array([0.0, *PERCENTILES, 100.0]) / 100.0
+    first, end = (int(np.searchsorted(known, value, side)) for side in ("left", "right"))
+    if end > first:  # some have this very value
+        return float(shares[first] + shares[end - 1]) / 2.0
+    low, high = known[first - 1], known[first]
+    part = (value - low) / (high - low) if np.isfinite(high - low) else 0.5
+    return float(shares[first - 1] + part * (shares[first] - shares[first - 1]))

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION
 from ..base.grid import begins_run, cell_keys, cell_numbers, key_offset
 from ..classifier.feature_forest import FeatureForest
-from ..classifier.interface import ClassStep, ModelObserver, PassInputs
+from ..classifier.interface import ModelObserver, PassInputs
 from ..classifier.model import Model
-from .input_words import show_value, words_for
+from .words import show_value, words_for
 
 #: Inputs that are named.
 _COUNT = 2
@@ -62,14 +62,6 @@ class _FirstPass(ModelObserver):
         worst = [at for at in np.argsort(speaks, kind="stable")[:_COUNT].tolist() if speaks[at] < 0]
         values = {names[at]: float(reasons.values[at]) for at in worst}
         return "; ".join(f"{words_for(n)[0]}: {show_value(n, v)}" for n, v in values.items())
-
-    def see_classes(
-        self, step: ClassStep, codes: NDArray[np.uint8], least: NDArray[np.float32] | None = None
-    ) -> None:
-        """Classes are not looked at."""
-
-    def see_lines(self, probability: NDArray[np.float32], codes: NDArray[np.uint8]) -> None:
-        """Lines are not looked for."""
 
 
 def inputs_against(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..base.dimensions import RELIABILITY
 from ..base.errors import OptionError
 from ..base.las import LasHeader, header_there
+from ..base.las_boxes import box_around, read_around
 from ..base.las_points import USUAL, LasColumns, layout_there
 from ..pipeline.classify_request import ClassifyRequest
 from ..pipeline.copies import selection
@@ -22,15 +23,15 @@ from ..pipeline.inputs_outputs import input_files, is_las
 from ..pipeline.run import Pipeline
 from ..pipeline.spatial_reference import Reference, check_one_reference, reference_of_file
 from ..stages.apply_model import ApplyModel
-from .explanation import AskedPlace, Explanation
-from .points_around import box_around, read_around
+from .explanation import Explanation
+from .places import AskedPlace
 from .recording import Reaches, Recording, ground_candidates
 from .trace_points import trace_point
 
 #: Files with fewer points together are read once, for all places (not tuned).
 _FEW_POINTS = 5_000_000
-#: Points that are read for one run at most, about: they take 0.4 GB a million.
-_MOST_POINTS = 10_000_000
+#: Points around places that count in full, at most about: they take 0.15 GB a million.
+_MOST_POINTS = 20_000_000
 #: Dimensions of all points that are read.
 _READ = (*USUAL, "ClassFlags")
 #: How the note on points that count less begins.
@@ -129,7 +130,7 @@ class _Cloud:
         )
         names = None if where else _READ
         cloud = read_around(self.files, near, outer, inner, names, reduce)
-        nearest = [cloud.nearest(place, unit) for place in places]
+        nearest = [place.nearest(cloud, unit) for place in places]
         rows = np.array([row for row, _ in nearest])
         recording = Recording(cloud, self.reference, where, rows)
         recording.run(pipeline, reaches, far)

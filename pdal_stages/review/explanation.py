@@ -19,14 +19,6 @@ _MAKERS = {
 }
 
 
-class AskedPlace(NamedTuple):
-    """A place at which a point is looked for, in the coordinates of the cloud."""
-
-    x: float
-    y: float
-    z: float | None = None
-
-
 @dataclass(frozen=True)
 class FoundPoint:
     """The point that is explained."""

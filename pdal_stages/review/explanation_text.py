@@ -1,26 +1,17 @@
 """Explanations as text: about a screen, for people who know lidar and not the code.
 
-The sentences are rows of explanation_rows.json, here is how they are filled in and the table of the
-model's inputs.
+The sentences are rows of words.json; here is their order, and the table of the model's inputs.
 """
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Sequence
-from functools import cache
-from importlib import resources
-from operator import attrgetter
 from pathlib import Path
-from string import Formatter
-from typing import cast
 
 from ..base.asprs import class_name
 from ..base.messages import one_line
-from .explanation import TOWERS, Explanation, GroundSteps, Noise, PassTrace, StepAfter, Verdict
-from .input_words import show_value, words_for
+from .explanation import TOWERS, Explanation, PassTrace, Verdict
 from .trace_points import SURROUNDINGS
+from .words import Record, fill, show_value, words_for
 
 #: Inputs that are shown of the last pass, beside its surroundings.
 _OF_LAST = 4
@@ -32,61 +23,9 @@ _NAME = 16
 _NUMBER = 12
 
 
-class _Fields(Formatter):
-    """Fills templates with fields and properties of a record, in the units of the text."""
-
-    def get_value(self, key: int | str, args: Sequence[object], kwargs: object) -> object:
-        """Return a field of the record, the only argument."""
-        return getattr(args[0], str(key))
-
-    def format_field(self, value: object, format_spec: str) -> str:
-        """Return a value in its unit."""
-        if isinstance(value, (float, int)) and format_spec in ("relative", "size"):
-            side = "below this point" if value <= 0 else "above this point"
-            return f"{abs(value):.2f} m {side if format_spec == 'relative' else ''}".rstrip()
-        if isinstance(value, int) and format_spec == "class":
-            return f"{value} {class_name(value)}"
-        if isinstance(value, dict) and format_spec == "windows":
-            return ", ".join(f"{high:.2f} m ({width:g} m window)" for width, high in value.items())
-        if format_spec == "line":
-            return one_line(str(value))
-        return "none" if value is None else super().format_field(value, format_spec)
-
-
-@cache
-def _tables() -> dict[str, list[tuple[str, str, str]]]:
-    """Return the rows by the record that they tell of: name, condition and text."""
-    text = resources.files(__package__).joinpath("explanation_rows.json").read_text("utf-8")
-    return json.loads(text)
-
-
-#: A part of a condition: a field, and the value or limit that it is compared with, if any.
-_CLAUSE = re.compile(r"(not )?([\w.]+)([=<>]?)(.*)")
-
-
-def _applies(condition: str, record: object) -> bool:
-    """Return whether a condition of a row holds."""
-    for clause in condition.split(" and ") if condition else ():
-        inverse, name, sign, limit = cast(re.Match[str], _CLAUSE.fullmatch(clause)).groups()
-        value = attrgetter(name)(record)
-        holds = str(value) == limit if sign == "=" else bool(value)
-        if sign in ("<", ">"):
-            holds = (value > float(limit)) == (sign == ">")
-        if holds == bool(inverse):
-            return False
-    return True
-
-
-Record = Explanation | Noise | GroundSteps | Verdict | StepAfter
-
-
 def _fill(table: str, record: Record, count: int | None = None) -> list[str]:
     """Return the rows of a table that apply to a record, or the first `count` of them."""
-    fields = _Fields()
-    chosen = [row for row in _tables()[table] if _applies(row[1], record)][:count]
-    return [
-        _row(fields.format(name, record), fields.format(text, record)) for name, _, text in chosen
-    ]
+    return [_row(name, text) for name, text in fill(table, record, count)]
 
 
 def _row(name: str, text: str) -> str:

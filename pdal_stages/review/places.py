@@ -5,13 +5,60 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from ..base.errors import OptionError, StageError
+from ..base.las_boxes import FilePoints
 from ..base.point_rows import read_point_rows
 from ..base.vector import reading, vector
+from ..features.cell_means import density
 from ..pipeline.inputs_outputs import input_files
 from ..pipeline.spatial_reference import reference_of_file
-from .explanation import AskedPlace
+
+#: Farthest that the nearest point may be, in meters, ...
+_FARTHEST_M = 2.0
+#: ... or in mean distances between points, where these are larger.
+_FARTHEST_SPACINGS = 3.0
+#: Meters within which points tell the mean distance between them.
+_SPACING_M = 50.0
+
+
+class AskedPlace(NamedTuple):
+    """A place at which a point is looked for, in the coordinates of the cloud."""
+
+    x: float
+    y: float
+    z: float | None = None
+
+    def nearest(self, cloud: FilePoints, unit: float) -> tuple[int, float]:
+        """Return the row of the nearest point and its distance in meters; StageError if far.
+
+        `unit` are the meters of a unit of the coordinates.
+        """
+        reason, target = "no point at all", np.array([v for v in self if v is not None])
+        if len(cloud.number):
+            x, y = (unit * (cloud[axis] - at) for axis, at in zip("XY", target[:2], strict=True))
+            rows = np.flatnonzero((np.abs(x) <= _SPACING_M) & (np.abs(y) <= _SPACING_M))
+            rows = rows if len(rows) else np.arange(len(x))
+            xyz = unit * np.column_stack([cloud[axis][rows] for axis in "XYZ"])
+            away = np.sqrt(((xyz[:, : len(target)] - unit * target) ** 2).sum(axis=1))
+            least, near = int(np.argmin(away)), away < _SPACING_M
+            spacing = 1.0 / np.sqrt(density(xyz[near])) if near.any() else 0.0
+            if away[least] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing):
+                return int(rows[least]), float(away[least])
+            reason = f"the nearest is {away[least]:.1f} m away"
+            flat = np.hypot(x[rows], y[rows])
+            if len(target) == 3 and flat.min() <= _FARTHEST_M:
+                height = cloud["Z"][rows[flat.argmin()]]
+                reason += f"; without Z {flat.min():.1f} m, at a height of {height:.2f}"
+        raise StageError(
+            "there is no point near this place",
+            where=" ".join(f"{value:.12g}" for value in target),
+            found=reason,
+            cure="Give X and Y in the cloud's reference system, or name theirs with --crs",
+        )
 
 
 def read_places(
@@ -43,10 +90,10 @@ def read_places(
         )
     places = _transform(places, crs, cloud) if crs else places
     for place in places:
-        if not all(math.isfinite(value) for value in place[:3] if value is not None):
+        if not all(math.isfinite(value) for value in place if value is not None):
             raise OptionError(
                 "a place is not of finite numbers in the cloud's reference system",
-                found=" ".join(f"{value:.12g}" for value in place[:3] if value is not None),
+                found=" ".join(f"{value:.12g}" for value in place if value is not None),
                 cure="Check the order of X and Y, and --crs",
             )
     return places

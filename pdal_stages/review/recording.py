@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from ..base.columns import SomeRows
 from ..base.errors import NoTerrainError
 from ..base.grid import GridWindow
+from ..base.las_boxes import Box, FilePoints, box_around, inside_box
 from ..base.messages import Topic
 from ..classifier.interface import ClassStep, PassInputs
 from ..pipeline.copies import run_stages, selection
@@ -26,7 +27,6 @@ from ..stages.apply_model import ApplyModel
 from ..stages.base import WHOLE_CLOUD, Kept, Observer, Stage, used_distances
 from ..stages.hag_morphological import HagMorphological
 from ..stages.points import RESERVED
-from .points_around import Box, FilePoints, box_around, inside_box
 
 #: The dimension by which stages know the points that are explained: negative.
 _OUTSIDE = f"{RESERVED}Outside"
@@ -104,7 +104,6 @@ class Recording(Observer):
     reference: Reference
     where: str | None  #: condition of the points that are classified
     rows: NDArray[np.int64]  #: (m,) of the points in question
-    rows_seen: NDArray[np.int64] = field(init=False)  #: (m,) of the points where stages run
     stages: list[Stage] = field(default_factory=list)
     classes: list[NDArray[np.uint8]] = field(default_factory=list)  #: (m,) after each stage
     pieces: list[PieceRasters] = field(default_factory=list)
@@ -136,7 +135,6 @@ class Recording(Observer):
         for each in ours:
             each.update_context(observer=self)
         around, known = self.cloud, selection(self.where, self.cloud)
-        self.rows_seen = self.rows
         try:
             seen = run_stages(ours[: reaches.first], around, wkt, known, self._keep_classes)
         except NoTerrainError as error:
@@ -157,7 +155,6 @@ class Recording(Observer):
             ours[reaches.first].update_context(blocks=blocks)
         self.cloud, self.rows = around.take(near), np.searchsorted(near, self.rows)
         self.cloud.load(_OF_RESULTS)
-        self.rows_seen = self.rows
         xy = np.column_stack([self.cloud[axis] for axis in "XY"])
         outside = unit * cKDTree(xy[self.rows]).query(xy, p=np.inf)[0]
         outside[self.rows] = -1.0
@@ -186,11 +183,11 @@ class Recording(Observer):
 
     def _keep_classes(self, each: ExpandedStage, seen: Mapping[str, NDArray]) -> None:
         self.stages.append(each.stage)
-        self.classes.append(seen["Classification"][self.rows_seen])
+        self.classes.append(seen["Classification"][self.rows])
 
     def see_noise(self, states: NDArray[np.uint8]) -> None:
         """Keep the states of noise."""
-        self.noise = states[self.rows_seen]
+        self.noise = states[self.rows]
 
     def see_raster(self, name: str, window: GridWindow, values: NDArray[np.float32]) -> None:
         """Keep a raster; the first step's begins another piece."""
@@ -200,11 +197,11 @@ class Recording(Observer):
 
     def see_heights(self, columns: Mapping[str, NDArray]) -> None:
         """Keep the columns of the ground filter."""
-        self.heights = {name: values[self.rows_seen] for name, values in columns.items()}
+        self.heights = {name: values[self.rows] for name, values in columns.items()}
 
     def see_kept(self, points: Mapping[Kept, NDArray[np.bool_]]) -> None:
         """Keep why the model leaves points alone."""
-        self.kept = {reason: which[self.rows_seen] for reason, which in points.items()}
+        self.kept = {reason: which[self.rows] for reason, which in points.items()}
 
     def see_inputs(self, inputs: PassInputs) -> None:
         """Keep what a pass read."""
@@ -217,12 +214,12 @@ class Recording(Observer):
         least: NDArray[np.float32] | None = None,
     ) -> None:
         """Keep classes after a step of the model's stage."""
-        limit = None if least is None else least[self.rows_seen]
-        self.steps[step] = codes[self.rows_seen], limit
+        limit = None if least is None else least[self.rows]
+        self.steps[step] = codes[self.rows], limit
 
     def see_lines(self, probability: NDArray[np.float32], codes: NDArray[np.uint8]) -> None:
         """Keep which points may be lines."""
-        self.lines = probability[self.rows_seen], codes[self.rows_seen]
+        self.lines = probability[self.rows], codes[self.rows]
         self._may_be_lines = bool(probability[self._used].any())
 
 

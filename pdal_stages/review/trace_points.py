@@ -12,7 +12,7 @@ from ..base.dimensions import opening
 from ..classifier.feature_forest import FeatureForest
 from ..classifier.interface import ClassStep, PassInputs
 from ..classifier.model import Model
-from ..classifier.training_percentiles import PERCENTILES, PercentileTable
+from ..classifier.training_percentiles import PercentileTable, share_below
 from ..stages.apply_model import ApplyModel
 from ..stages.base import Kept
 from ..stages.detached_noise import DetachedNoise
@@ -210,7 +210,7 @@ def _verdict(recording: Recording, place: int, against: int) -> Verdict:
     by_pass: dict[int, PassTrace] = {}
     stands = None
     for each in recording.inputs:
-        rows = np.flatnonzero(each.rows == recording.rows_seen[place])
+        rows = np.flatnonzero(each.rows == recording.rows[place])
         if each.number not in by_pass and rows.size:
             by_pass[each.number] = _trace_pass(model, each, int(rows[0]))
             xyz = [recording.cloud[axis][recording.rows[place]] for axis in "XYZ"]
@@ -253,21 +253,6 @@ def _percentiles(model: Model, number: int) -> PercentileTable:
     """Return the percentiles of a pass: the first pass of a training has them for all."""
     entries = model.info["passes"][number::-1]
     return next((entry["percentiles"] for entry in entries if entry.get("percentiles")), {})
-
-
-def share_below(value: float, percentiles: Sequence[float]) -> float:
-    """Return the share of training samples with lower values, by :data:`PERCENTILES`.
-
-    Of values that many samples have it is the middle of their shares.
-    """
-    known = np.array([-np.inf, *percentiles, np.inf])
-    shares = np.array([0.0, *PERCENTILES, 100.0]) / 100.0
-    first, end = (int(np.searchsorted(known, value, side)) for side in ("left", "right"))
-    if end > first:  # some have this very value
-        return float(shares[first] + shares[end - 1]) / 2.0
-    low, high = known[first - 1], known[first]
-    part = (value - low) / (high - low) if np.isfinite(high - low) else 0.5
-    return float(shares[first - 1] + part * (shares[first] - shares[first - 1]))
 
 
 def _steps_of_model(recording: Recording, place: int) -> list[tuple[str, int]]:

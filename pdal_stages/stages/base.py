@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import Enum
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,7 @@ class Kept(Enum):
     KEPT = 4
 
 
-class Observer(ModelObserver, Protocol):
+class Observer(ModelObserver):
     """Receives how stages come to their results; (n,) are the points that the stage runs on."""
 
     def see_noise(self, states: NDArray[np.uint8]) -> None:

@@ -1,4 +1,4 @@
-"""Points of files around places: all that lie near, and what the ground needs of those far away."""
+"""Points of LAS files in boxes, of which only the parts are read that hold them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.columns import LazyColumns
-from ..base.errors import StageError
-from ..base.las_check import beyond_box
-from ..base.las_points import LasColumns, Layout, read_records
-from ..features.cell_means import density
-from .explanation import AskedPlace
+from .columns import LazyColumns
+from .las_check import beyond_box
+from .las_points import LasColumns, Layout, read_records
 
 #: West, south, east, north.
 Box = Sequence[float]
@@ -22,12 +19,6 @@ Box = Sequence[float]
 _PROBED = 1000
 #: Points of a chunk of a LAZ file, as a rule: a part is read from the beginning of one.
 _CHUNK = 50_000
-#: Farthest that the nearest point may be, in meters, ...
-_FARTHEST_M = 2.0
-#: ... or in mean distances between points, where these are larger.
-_FARTHEST_SPACINGS = 3.0
-#: Meters within which points tell the mean distance between them.
-_SPACING_M = 50.0
 
 
 @dataclass(eq=False)
@@ -70,34 +61,6 @@ class FilePoints(LazyColumns):
                     at += len(records)
         columns = LasColumns(parts)
         self.columns |= {name: columns[name] for name in wanted}
-
-    def nearest(self, place: AskedPlace, unit: float) -> tuple[int, float]:
-        """Return the row of the nearest point and its distance in meters; StageError if far.
-
-        `unit` are the meters of a unit of the coordinates.
-        """
-        reason, target = "no point at all", np.array([v for v in place[:3] if v is not None])
-        if len(self.number):
-            x, y = (unit * (self[axis] - at) for axis, at in zip("XY", target[:2], strict=True))
-            rows = np.flatnonzero((np.abs(x) <= _SPACING_M) & (np.abs(y) <= _SPACING_M))
-            rows = rows if len(rows) else np.arange(len(x))
-            xyz = unit * np.column_stack([self[axis][rows] for axis in "XYZ"])
-            away = np.sqrt(((xyz[:, : len(target)] - unit * target) ** 2).sum(axis=1))
-            least, near = int(np.argmin(away)), away < _SPACING_M
-            spacing = 1.0 / np.sqrt(density(xyz[near])) if near.any() else 0.0
-            if away[least] <= max(_FARTHEST_M, _FARTHEST_SPACINGS * spacing):
-                return int(rows[least]), float(away[least])
-            reason = f"the nearest is {away[least]:.1f} m away"
-            flat = np.hypot(x[rows], y[rows])
-            if len(target) == 3 and flat.min() <= _FARTHEST_M:
-                height = self["Z"][rows[flat.argmin()]]
-                reason += f"; without Z {flat.min():.1f} m, at a height of {height:.2f}"
-        raise StageError(
-            "there is no point near this place",
-            where=" ".join(f"{value:.12g}" for value in target),
-            found=reason,
-            cure="Give X and Y in the cloud's reference system, or name theirs with --crs",
-        )
 
 
 def read_around(
