@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,14 +53,14 @@ def refuse_other_lengths(reference: npt.NDArray, others: Mapping[str, npt.NDArra
             )
 
 
-def code_of(what: str, value: Any, most: int = MAX_LABEL) -> int:
+def code_of(what: str, value: object, most: int = MAX_LABEL) -> int:
     """Return a class code; digits as text (JSON keys) are allowed."""
     if isinstance(value, str) and value.strip().isdecimal():
         value = int(value)
     return checks.whole(what, value, 0, most)
 
 
-def code_list(codes: Iterable[Any], option: str) -> list[int]:
+def code_list(codes: Iterable[object], option: str) -> list[int]:
     """Return class codes as ints."""
     return [code_of(f"a class in '{option}'", code) for code in codes]
 
@@ -74,7 +73,7 @@ class Merge:
     names: dict[int, str]  #: names of merged classes
 
     @classmethod
-    def parse(cls, mapping: Mapping[Any, Any] | None) -> Merge:
+    def parse(cls, mapping: Mapping[object, object] | None) -> Merge:
         """Read a mapping ``{5: [3, 4]}``; keys and codes may be text.
 
         Raises
@@ -128,13 +127,13 @@ class ComparedClasses:
     #: classes of the reference to compare, after merging; points of other classes are left out and
     #: counted. By default every class that occurs
     classes: Iterable[int] | None = None
-    names: Mapping[Any, str] | None = None  #: code to name, where it is not ASPRS's
+    names: Mapping[object, str] | None = None  #: code to name, where it is not ASPRS's
     #: reference codes, before merging, whose points are left out and counted. By default those that
     #: training leaves out: 0 and 1 (unclassified), 7 and 18 (noise), 12 (overlap); none where
     #: `classes` is set
     ignore: Iterable[int] | None = None
     #: classes to take as one, on both sides: ``{5: [3, 4]}``
-    merge: Mapping[Any, Any] | None = None
+    merge: Mapping[object, object] | None = None
 
     def select(
         self, codes: npt.NDArray[np.int64], merge: Merge

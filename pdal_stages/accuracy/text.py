@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Protocol
 
 from ..base.json_types import JsonObject
 
@@ -11,18 +11,26 @@ from ..base.json_types import JsonObject
 _MAIN = ("overall_accuracy", "kappa", "mean_f1")
 
 
+class Measured(Protocol):
+    """Measures of accuracy, as :class:`.measures.Accuracy` has them."""
+
+    @property
+    def points(self) -> int:
+        """Number of points that were compared."""
+
+
 def percent(share: float | None, digits: int = 2) -> str:
     """Return a share in percent, without its sign; ``-`` where it is not defined."""
     return "-" if share is None else f"{100 * share:.{digits}f}"
 
 
-def summary(accuracy: Any) -> JsonObject:
+def summary(accuracy: Measured) -> JsonObject:
     """Return the main measures of an ``Accuracy``, None without points."""
     shares = {name: getattr(accuracy, name) if accuracy.points else None for name in _MAIN}
     return {"points": accuracy.points, **shares}
 
 
-def by_file(names: Sequence[str], each: Sequence[Any]) -> str:
+def by_file(names: Sequence[str], each: Sequence[Measured]) -> str:
     """Return a table with a line for each file, the worst first."""
     rows = [(name, summary(accuracy)) for name, accuracy in zip(names, each, strict=True)]
     # Files without points to compare come last.

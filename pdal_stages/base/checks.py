@@ -8,16 +8,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from .errors import OptionError, suggest
 from .json_types import JsonObject
 
+_Value = TypeVar("_Value")
+
 
 def whole(
-    what: str, value: Any, low: int | None = None, high: int | None = None, *, unit: str = ""
+    what: str, value: object, low: float | None = None, high: float | None = None, *, unit: str = ""
 ) -> int:
     """Return a whole number within bounds, both included; 2.0 is one, too.
 
@@ -41,7 +43,7 @@ def whole(
 
 def number(
     what: str,
-    value: Any,
+    value: object,
     low: float | None = None,
     high: float | None = None,
     *,
@@ -57,14 +59,14 @@ def number(
     return float(x)
 
 
-def flag(what: str, value: Any) -> bool:
+def flag(what: str, value: object) -> bool:
     """Return a truth value; see :func:`whole`."""
     if not isinstance(value, bool | np.bool_):
         raise OptionError(f"{what} must be true or false", found=_shown(value))
     return bool(value)
 
 
-def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
+def one_of(what: str, value: _Value, choices: Iterable[object]) -> _Value:
     """Return a value that is one of the choices; see :func:`whole`."""
     known = list(choices)
     if not any(type(value) is type(choice) and value == choice for choice in known):
@@ -77,7 +79,7 @@ def one_of(what: str, value: Any, choices: Iterable[Any]) -> Any:
     return value
 
 
-def names(what: str, value: Any) -> tuple[str, ...]:
+def names(what: str, value: object) -> tuple[str, ...]:
     """Return names without duplicates, from a list or comma-separated text; see :func:`whole`."""
     if isinstance(value, str):
         value = [part.strip() for part in value.split(",") if part.strip()]
@@ -99,7 +101,7 @@ def bounds(low: float | None, high: float | None, above: bool = False, unit: str
     return f" from {_plain(low)} to {_plain(high)}{unit}"
 
 
-def finite(value: Any) -> int | float | None:
+def finite(value: object) -> int | float | None:
     """Return a number that is finite as a double; None for anything else, booleans too."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
@@ -119,7 +121,7 @@ def _plain(bound: float) -> str:
     return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -151,7 +153,7 @@ def strict_json(text: str | bytes) -> Any:
     return value
 
 
-def refuse_nested(value: Any) -> None:
+def refuse_nested(value: object) -> None:
     """Refuse lists and objects inside each other, more than `MOST_NESTED` deep, by ValueError."""
     level = [value]
     for _ in range(MOST_NESTED + 1):
@@ -168,13 +170,13 @@ def refuse_constant(word: str) -> None:
     raise ValueError(f"{word} is not a JSON number")
 
 
-def _finite(word: str, kind: type = float) -> Any:
+def _finite(word: str, kind: type[float] = float) -> float:
     if not math.isfinite(float(word)):
         raise ValueError(f"{word[:40]} is too large for a number")
     return kind(word)
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> JsonObject:
+def _unique(pairs: list[tuple[str, object]]) -> JsonObject:
     out = dict(pairs)
     if len(out) != len(pairs):
         raise ValueError("duplicate key in one object")

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 
 class StageError(Exception):
@@ -110,7 +111,7 @@ def how_to_add(extra: str) -> str:
     return f"pip install 'pdal-stages[{extra}]' (from a clone: pip install '.[{extra}]')"
 
 
-def optional_import(module: str, extra: str, purpose: str):
+def optional_import(module: str, extra: str, purpose: str) -> ModuleType:
     """Import an optional package, or raise a DependencyError that names our extra with it."""
     import importlib
 

@@ -25,7 +25,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, BinaryIO, NoReturn
 
 from .companions import is_open_database, remove_companions
 from .errors import StageError, WriteError
@@ -284,7 +284,9 @@ def write_whole(path: str | os.PathLike, content: bytes, what: str = "output") -
     return Path(path)
 
 
-def write_json(path: str | os.PathLike, value: Any, what: str = "output", indent: int = 1) -> Path:
+def write_json(
+    path: str | os.PathLike, value: object, what: str = "output", indent: int = 1
+) -> Path:
     """Write a JSON file whole or not at all; values that JSON does not have become text."""
     return write_whole(path, (json.dumps(value, indent=indent, default=str) + "\n").encode(), what)
 
@@ -412,7 +414,7 @@ def _give_name(partial: Path, target: Path) -> None:
     os.replace(partial, real)
 
 
-def _pour(file: Any, target: Path) -> None:
+def _pour(file: BinaryIO, target: Path) -> None:
     """Copy a file into a device, a pipe, or an open file of this process at its position."""
     there = os.stat(target)
     for stream in (sys.stdout, sys.stderr):
@@ -462,7 +464,7 @@ def _remove_dead(folder: Path) -> None:
         os.close(lock)
 
 
-def try_lock(file: Any) -> bool:
+def try_lock(file: IO | int) -> bool:
     """Lock an open file or descriptor until it is closed; return False if another has the lock.
 
     Raises

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ _CLOUD_OPTIMIZED = {
 }  # fmt: skip
 
 
-def rasterio() -> Any:
+def rasterio() -> ModuleType:
     """Import rasterio, or raise DependencyError with the way to install it."""
     return optional_import("rasterio", "raster", "writing rasters")
 

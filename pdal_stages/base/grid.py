@@ -68,7 +68,7 @@ def _refuse_beyond(number: npt.NDArray, limit: int) -> None:
         )
 
 
-def cell_keys(column: npt.NDArray, row: npt.NDArray, layer: Any = 0) -> Integers:
+def cell_keys(column: npt.NDArray, row: npt.NDArray, layer: npt.NDArray | int = 0) -> Integers:
     """Return one number for each cell, ascending by layer, row and column.
 
     Parameters
@@ -222,7 +222,7 @@ def compact_keys(coordinates: npt.NDArray[np.float64], size: float) -> tuple[Int
     keys = np.empty(n, np.int64)
     for start in range(0, n, _BATCH):
         batch = slice(start, start + _BATCH)
-        key: Any = 0
+        key: Integers | int = 0
         for place, (k, length) in enumerate(zip(axes, lengths, strict=True)):
             key = key * length + cell_numbers(coordinates[batch, k], size) - first[place]
         keys[batch] = key

@@ -54,6 +54,6 @@ def hash_rows(columns: Iterable[npt.ArrayLike], seed: int) -> npt.NDArray[np.uin
     return out
 
 
-def fingerprint(*parts: Any) -> str:
+def fingerprint(*parts: object) -> str:
     """Return a digest of JSON-able values."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:32]

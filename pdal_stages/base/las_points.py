@@ -14,7 +14,7 @@ import struct
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -314,7 +314,7 @@ def read_records(
 
 
 def _parts(
-    file: Any, layout: Layout, start: int, end: int, most: int, only: Sequence[str] | None
+    file: BinaryIO, layout: Layout, start: int, end: int, most: int, only: Sequence[str] | None
 ) -> Iterator[NDArray]:
     """Yield the records of an open file."""
     header, dtype = layout.header, layout.dtype

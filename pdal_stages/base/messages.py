@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
+from typing import Any, TextIO
 
 from .json_types import JsonObject
 
@@ -95,7 +95,7 @@ def duration(seconds: float) -> str:
 class PlainStream:
     """A text stream that passes text through :func:`plain` and delegates everything else."""
 
-    def __init__(self, stream: Any) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self.stream = stream
 
     def write(self, text: str) -> int:

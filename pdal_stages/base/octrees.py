@@ -12,19 +12,21 @@ import os
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from .checks import strict_json
 from .errors import StageError
 from .json_types import JsonObject
 from .las import read_header, records_of
 
+#: Where a node or page lies in its file.
+_Place = TypeVar("_Place")
 #: Level, x, y and z of a node.
 Key = tuple[int, int, int, int]
 #: Number of points of each node, and their location.
-Nodes = dict[Key, tuple[int, Any]]
+Nodes = dict[Key, tuple[int, _Place]]
 #: Entries of a page: nodes, or with -1 points other pages.
-Entries = Iterator[tuple[Key, int, Any]]
+Entries = Iterator[tuple[Key, int, _Place]]
 
 #: Deeper nodes would be smaller than a step of the coordinates, which have 32 bits.
 _DEEPEST = 31
@@ -149,10 +151,10 @@ def check_ept(path: str) -> JsonObject:
         raise StageError(what, where=path, found=str(error), cure=cure) from None
 
 
-def _walk(root: Any, entries: Callable[[Any], Entries]) -> Nodes:
+def _walk(root: _Place, entries: Callable[[_Place], Entries[_Place]]) -> Nodes[_Place]:
     """Return all nodes of an octree from its first page on; ValueError for a wrong one."""
-    nodes: Nodes = {}
-    waiting: list[tuple[Key, Any]] = [((0, 0, 0, 0), root)]
+    nodes: Nodes[_Place] = {}
+    waiting: list[tuple[Key, _Place]] = [((0, 0, 0, 0), root)]
     while waiting:  # not without end: a page that comes again has its nodes twice
         first, page = waiting.pop()
         for key, count, place in entries(page):

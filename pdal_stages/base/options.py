@@ -15,6 +15,7 @@ from typing import Any
 
 from . import checks
 from .errors import OptionError, suggest
+from .json_types import JsonObject
 from .messages import shorten
 from .selections import Selection, split_selection
 
@@ -85,9 +86,9 @@ class Option:
         """Return the default as a user would type it, with its unit."""
         return f"{self.typed_default} {self.unit}".strip() if self.typed_default else ""
 
-    def schema(self) -> dict:
+    def schema(self) -> JsonObject:
         """Return the option's JSON Schema."""
-        out: dict[str, Any] = {"description": self.help, "type": _KINDS[self.kind][0]}
+        out: JsonObject = {"description": self.help, "type": _KINDS[self.kind][0]}
         if self.minimum is not None:
             out["exclusiveMinimum" if self.exclusive else "minimum"] = self.minimum
         if self.maximum is not None:
@@ -98,44 +99,44 @@ class Option:
             out["default"] = self.default
         return out
 
-    def decode(self, value: Any) -> Any:
+    def decode(self, value: object) -> object:
         """Return the object or list of a JSON text, where the option takes an object.
 
         Stock PDAL and the command line give options as text. Other values return as they are.
         """
-        is_json = isinstance(value, str) and value.lstrip().startswith(("{", "["))
-        if not is_json or "object" not in _KINDS[self.kind][0]:
+        takes_object = "object" in _KINDS[self.kind][0]
+        if not (takes_object and isinstance(value, str) and value.lstrip().startswith(("{", "["))):
             return value
         try:
             return checks.strict_json(value)
         except (ValueError, RecursionError):
             raise self._wrong(value) from None
 
-    def parse(self, value: Any) -> Any:
+    def parse(self, value: object) -> Any:
         """Parse a value from JSON or the command line; OptionError where it does not fit."""
-        parsed: Any = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
+        parsed = getattr(self, f"_parse_{self.kind}", self._parse_string)(value)
         if self.choices:
             checks.one_of(f"option '{self.name}'", parsed, self.choices)
         return parsed
 
-    def _wrong(self, value: Any) -> OptionError:
+    def _wrong(self, value: object) -> OptionError:
         what = f"option '{self.name}' must be {_KINDS[self.kind][1]}"
         return OptionError(what, found=shorten(json.dumps(value, default=str)))
 
-    def check(self, what: str, value: Any) -> Any:
+    def check(self, what: str, value: object) -> Any:
         """Return a value that fits, of a number, a truth value or choices; others as they are."""
-        limits: Any = self.minimum, self.maximum
+        low, high = self.minimum, self.maximum
         if self.choices:
             return checks.one_of(what, value, self.choices)
         if self.kind == "boolean":
             return checks.flag(what, value)
         if self.kind == "integer":
-            return checks.whole(what, value, *limits, unit=self.unit)
+            return checks.whole(what, value, low, high, unit=self.unit)
         if self.kind == "number":
-            return checks.number(what, value, *limits, above=self.exclusive, unit=self.unit)
+            return checks.number(what, value, low, high, above=self.exclusive, unit=self.unit)
         return value
 
-    def _parse_number(self, value: Any) -> float:
+    def _parse_number(self, value: object) -> float:
         with suppress(ValueError):
             value = float(value) if isinstance(value, str) else value
         kind = "integer" if self.kind == "integer" else "number"
@@ -143,13 +144,13 @@ class Option:
 
     _parse_integer = _parse_number
 
-    def _parse_boolean(self, value: Any) -> bool:
+    def _parse_boolean(self, value: object) -> bool:
         word = str(value).strip().lower()
         if not isinstance(value, bool | str) or word not in ("true", "false"):
             raise self._wrong(value)
         return word == "true"
 
-    def _parse_string(self, value: Any) -> str:
+    def _parse_string(self, value: object) -> str:
         if not isinstance(value, str):
             raise self._wrong(value)
         if self.kind in ("filename", "folder", "model", "expression") and not value.strip():
@@ -159,13 +160,13 @@ class Option:
             )
         return value
 
-    def _parse_classes(self, value: Any) -> Any:
+    def _parse_classes(self, value: object) -> str | list | dict:
         """Leave the reading to :class:`..classifier.class_map.ClassMap`."""
         if not isinstance(value, str | list | dict):
             raise self._wrong(value)
         return value
 
-    def _parse_list(self, value: Any) -> list:
+    def _parse_list(self, value: object) -> list:
         if isinstance(value, str):
             value = split_list(value)
         elif checks.finite(value) is not None:
@@ -182,10 +183,10 @@ class Option:
             )
         return list(value)
 
-    def _parse_numbers(self, value: Any) -> list[float]:
+    def _parse_numbers(self, value: object) -> list[float]:
         return [self._parse_number(item) for item in self._parse_list(value)]
 
-    def _parse_codes(self, value: Any) -> list[int]:
+    def _parse_codes(self, value: object) -> list[int]:
         chosen = self._parse_selection(value)
         if chosen.spans:
             raise OptionError(
@@ -194,10 +195,10 @@ class Option:
             )
         return list(chosen.codes)
 
-    def _parse_selection(self, value: Any) -> Selection:
+    def _parse_selection(self, value: object) -> Selection:
         return Selection.parse(self._parse_list(split_selection(value)), self.name)
 
-    def _parse_mapping(self, value: Any) -> dict:
+    def _parse_mapping(self, value: object) -> dict:
         if not isinstance(value, dict):
             raise self._wrong(value)
         return value
@@ -205,7 +206,7 @@ class Option:
 
 def option(
     kind: str,
-    default: Any,
+    default: object,
     help: str,
     minimum: float | None = None,
     maximum: float | None = None,
@@ -220,11 +221,11 @@ def option(
 
 
 #: A function of the name and the value of a setting; it returns what the field holds.
-Check = Callable[[str, Any], Any]
+Check = Callable[[str, object], object]
 
 
 def setting(
-    default: Any,
+    default: object,
     kind: str,
     help: str,
     minimum: float | None = None,
@@ -264,13 +265,13 @@ def split_list(text: str) -> list[str]:
     return [part.strip() for part in re.split(r",(?![^(]*\))", text) if part.strip()]
 
 
-def decode_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[str, Any]:
+def decode_options(declared: Iterable[Option], raw: Mapping[str, object]) -> dict[str, object]:
     """Return raw options with the objects that are given as text decoded."""
     known = {option.name: option for option in declared}
     return {name: known[name].decode(raw[name]) if name in known else raw[name] for name in raw}
 
 
-def parse_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[str, Any]:
+def parse_options(declared: Iterable[Option], raw: Mapping[str, object]) -> JsonObject:
     """Return the value of every declared option; OptionError where a raw one does not fit."""
     known = {option.name: option for option in declared}
     for name in raw:
@@ -280,7 +281,7 @@ def parse_options(declared: Iterable[Option], raw: Mapping[str, Any]) -> dict[st
                 found=json.dumps(raw[name], default=str)[:80],
                 cure=f"{suggest(name, known)}Options: {', '.join(sorted(known))}",
             )
-    values: dict[str, Any] = {}
+    values: JsonObject = {}
     for name, option in known.items():
         if name in raw:
             try:

@@ -56,7 +56,7 @@ class Selection:
         return bool(self.codes or self.spans)
 
     @classmethod
-    def parse(cls, items: Iterable[Any], option: str) -> Selection:
+    def parse(cls, items: Iterable[object], option: str) -> Selection:
         """Read class codes, ranges and the word ``withheld``; errors name the option."""
         codes: list[int] = []
         spans: list[Span] = []
@@ -81,6 +81,6 @@ class Selection:
         return cls(tuple(dict.fromkeys(codes)), tuple(dict.fromkeys(spans)))
 
 
-def split_selection(value: Any) -> Any:
+def split_selection(value: object) -> Any:
     """Split the text of a selection at commas: ``9,Z[1:2)`` are two; return others unchanged."""
     return value.split(",") if isinstance(value, str) else value

@@ -9,14 +9,13 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from .errors import StageError
-from .json_types import JsonObject
+from .json_types import JsonObject, StageJson
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 #: Lines that are converted at a time.
@@ -54,7 +53,7 @@ class TextPoints:
 
     def las_options(self) -> JsonObject:
         """Return scales and offsets of ``writers.las`` that hold the coordinates exactly."""
-        options: dict[str, Any] = {}
+        options: StageJson = {}
         for axis, decimals in self.decimals.items():
             offset = float(math.floor(self.low[axis]))
             while decimals and (self.high[axis] - offset) * 10.0**decimals >= 2**31:
@@ -64,7 +63,7 @@ class TextPoints:
         return options
 
 
-def check_text(path: str, options: Mapping[str, Any]) -> TextPoints:
+def check_text(path: str, options: StageJson) -> TextPoints:
     """Refuse a text file that PDAL would misread; return what it holds.
 
     Parameters
@@ -85,7 +84,7 @@ def check_text(path: str, options: Mapping[str, Any]) -> TextPoints:
         raise error.at(path) from None
 
 
-def _check_lines(file: Iterator[str], options: Mapping[str, Any]) -> TextPoints:
+def _check_lines(file: Iterator[str], options: StageJson) -> TextPoints:
     skipped = sum(1 for _ in itertools.islice(file, int(options.get("skip") or 0)))
     header = str(options.get("header") or next(file, "")).rstrip("\r\n")
     number = skipped + (not options.get("header"))

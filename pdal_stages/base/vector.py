@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,14 @@ from .errors import OptionError, StageError, optional_import
 from .files import kind_of
 from .processes import PythonProcess
 
+if TYPE_CHECKING:
+    from pyproj import CRS
+    from shapely import Polygon
 
-def vector(name: str) -> Any:
+_Result = TypeVar("_Result")
+
+
+def vector(name: str) -> ModuleType:
     """Import shapely, pyogrio or pyproj, or raise DependencyError with the way to install it."""
     return optional_import(name, "vector", "work with vector data")
 
@@ -66,7 +73,7 @@ def reading(
         ) from error
 
 
-def with_vector(function: Callable[..., Any], *arguments: Any) -> Any:
+def with_vector(function: Callable[..., _Result], *arguments: object) -> _Result:
     """Call a function that uses the extra ``vector``, where necessary in a process of its own.
 
     On Linux the libraries that a program is linked to come first for everything it loads. Inside
@@ -163,7 +170,7 @@ def inside_of(
     return points_inside(x, y, shapes), len(shapes), note
 
 
-def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[list[Any], str]:
+def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[list[Polygon], str]:
     """Return the polygons near a box, and a warning or an empty text.
 
     Polygons and box are in the reference system `wkt`. `where` is a condition on the file's
@@ -190,7 +197,7 @@ def polygons_of(overlay: Overlay, wkt: str, box: Box, where: str = "") -> tuple[
         return list(shapely.make_valid(shapes)), note
 
 
-def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Any, Any]:
+def _transform(file: str, crs: str, wkt: str, box: Box) -> tuple[Callable | None, Box]:
     """Return the transformation from the file's reference system to the points', and the box in it.
 
     The transformation is None where both are the same.
@@ -217,7 +224,7 @@ def horizontal_wkt(wkt: str) -> str:
     return _horizontal(vector("pyproj").CRS.from_user_input(wkt)).to_wkt() if wkt else ""
 
 
-def _horizontal(crs: Any) -> Any:
+def _horizontal(crs: CRS) -> CRS:
     """Return the horizontal part of a reference system."""
     if crs.is_compound:
         return _horizontal(crs.sub_crs_list[0])
@@ -225,7 +232,7 @@ def _horizontal(crs: Any) -> Any:
 
 
 def points_inside(
-    x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Any]
+    x: NDArray[np.float64], y: NDArray[np.float64], polygons: list[Polygon]
 ) -> NDArray[np.bool_]:
     """Return which points (n,) lie inside polygons, or on their edge.
 

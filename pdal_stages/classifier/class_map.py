@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +36,10 @@ class ClassMap:
 
     @classmethod
     def parse(
-        cls, spec: Any, labels_found: Iterable[int] = (), left_out: Collection[int] = UNINFORMATIVE
+        cls,
+        spec: object,
+        labels_found: Iterable[int] = (),
+        left_out: Collection[int] = UNINFORMATIVE,
     ) -> ClassMap:
         """Read the option `classes`.
 
@@ -102,7 +104,7 @@ class ClassMap:
         return table[np.minimum(labels, highest + 1)]
 
 
-def _labels(text: Any) -> tuple[int, ...]:
+def _labels(text: object) -> tuple[int, ...]:
     """Return the labels that ``"3,4,5"``, ``"3-5"`` or 3 stands for."""
     if not isinstance(text, str):
         return (_code(text, "label"),)
@@ -120,7 +122,7 @@ def _labels(text: Any) -> tuple[int, ...]:
     return tuple(dict.fromkeys(labels))
 
 
-def _code(value: Any, what: str) -> int:
+def _code(value: object, what: str) -> int:
     try:
         return code_of(f"a class {what}", value, MAX_CODE if what == "code" else MAX_LABEL)
     except OptionError as error:
@@ -128,7 +130,7 @@ def _code(value: Any, what: str) -> int:
         raise
 
 
-def _target(value: Any) -> tuple[int, str | None]:
+def _target(value: object) -> tuple[int, str | None]:
     """Return the code and name that a mapping's value stands for."""
     if not isinstance(value, str):
         return _code(value, "code"), None

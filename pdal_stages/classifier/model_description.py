@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 from ..base.json_types import JsonObject, StageJson
 from ..base.messages import one_line
@@ -178,5 +178,5 @@ def score(info: ModelInfo) -> str:
     return "{:<15}  overall accuracy {}, kappa {}, mean F1 {}".format(label, *values)
 
 
-def _percent(value: Any) -> str:
+def _percent(value: object) -> str:
     return f"{100 * value:.1f} %" if isinstance(value, float) else "-"

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 # ruff: noqa: RUF009  options are declared, nothing is shared
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ..base import checks
 from ..base.asprs import BUILDING, NOISE
 from ..base.errors import OptionError
-from ..base.options import Settings, setting
+from ..base.json_types import JsonObject
+from ..base.options import Check, Settings, setting
 from ..base.threads import resolve_threads
 from ..features import FeaturePlan
 from ..features.voxels import LARGEST, check_side
@@ -34,17 +35,17 @@ DEFAULT_CONTEXT = ("box1", "box4", "columnvotes1", "columnvotes4", "columnvotes8
 CONTEXT_OF_BASE = ("own", "box1", "columnvotes2", "columnvotes8")
 
 
-def _each(check: Callable[..., Any], *limits: float, **more: Any) -> Callable[..., Any]:
+def _each(check: Callable[..., float], *limits: float, **more: bool) -> Check:
     """Return a check of a number, or of each number in a list."""
 
-    def check_all(what: str, value: Any) -> tuple[Any, ...]:
-        numbers = [value] if isinstance(value, int | float) else value
+    def check_all(what: str, value: object) -> tuple[float, ...]:
+        numbers = value if isinstance(value, Iterable) else [value]
         return tuple(check(what, each, *limits, **more) for each in numbers)
 
     return check_all
 
 
-def _check_voxel(what: str, value: Any) -> float:
+def _check_voxel(what: str, value: object) -> float:
     return check_side(checks.number(what, value))
 
 
@@ -276,7 +277,7 @@ class TrainingOptions(Settings):
             )
         resolve_threads(self.threads)
 
-    def _set(self, **values: Any) -> None:
+    def _set(self, **values: object) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -339,7 +340,7 @@ _WEINMANN = {
 }
 
 #: Options of ``writers.classifiermodel``, by the word that users type.
-RECIPES: dict[str, dict[str, Any]] = {
+RECIPES: dict[str, JsonObject] = {
     "blomley2016": {
         "neighborhoods": ("blomley2016",),  # 3.1 four cylinders and k_opt
         "feature_set": ("all",),  # 3.2 shape measures and shape distributions
@@ -409,12 +410,12 @@ RECIPES: dict[str, dict[str, Any]] = {
 }
 
 
-def with_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
+def with_recipe(options: Mapping[str, object]) -> JsonObject:
     """Return options with those of the recipes that they name filled in, the last one first.
 
     Options of the network are merged one by one. OptionError for an unknown recipe.
     """
-    values: dict[str, Any] = {}
+    values: JsonObject = {}
     for name in checks.names("option 'recipe'", options.get("recipe") or ()):
         checks.one_of("option 'recipe'", name, tuple(RECIPES))
         values |= RECIPES[name]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError, suggest
+from ..base.json_types import JsonObject
 from .parser import Parser
 
 #: Version of the JSON of ``commands``: readers, such as the plugin for QGIS, refuse others, so it
@@ -118,12 +119,12 @@ def _commands(main_parser: Parser, options: argparse.Namespace) -> None:
     from ..classifier.model_file import shipped
     from ..stages.registry import stage_types
 
-    def describe_command(parser: Parser) -> dict[str, Any]:
+    def describe_command(parser: Parser) -> JsonObject:
         shown = (a for a in parser.arguments if a.help != argparse.SUPPRESS and a.dest != "help")
         arguments = [_argument(action, action in parser.repeatable) for action in shown]
         return {"help": parser.description, "arguments": arguments}
 
-    def describe_option(option: Any) -> dict[str, Any]:
+    def describe_option(option: Any) -> JsonObject:
         shown = option.typed_default if isinstance(option.default, tuple) else option.default
         return asdict(option) | {"default": shown}
 
@@ -141,7 +142,7 @@ def _commands(main_parser: Parser, options: argparse.Namespace) -> None:
     print(json.dumps(content, indent=1))
 
 
-def _argument(action: argparse.Action, many: bool) -> dict[str, Any]:
+def _argument(action: argparse.Action, many: bool) -> JsonObject:
     switch = action.nargs == 0
     of_choices = type(next(iter(action.choices))) if action.choices else None
     value_type: Any = action.type or of_choices

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 from ..base.errors import StageError, suggest
+from ..base.json_types import JsonObject
 from ..base.version import __version__
 
 #: Modules and their commands. Only the module of the requested command is imported. ``commands`` is
@@ -98,7 +99,7 @@ class Parser(argparse.ArgumentParser):
             group.add_argument(*flags, **declared), declared
         )
 
-    def _list(self, action: argparse.Action, declared: dict[str, Any]) -> argparse.Action:
+    def _list(self, action: argparse.Action, declared: JsonObject) -> argparse.Action:
         self.arguments.append(action)
         if declared.get("action") == "append" or action.nargs in ("+", "*"):
             self.repeatable.append(action)
@@ -138,7 +139,7 @@ class Parser(argparse.ArgumentParser):
     def command(
         self,
         name: str,
-        run: Callable[[argparse.Namespace], Any],
+        run: Callable[[argparse.Namespace], int | None],
         help: str,
         *,
         overrides: bool = False,
@@ -199,6 +200,6 @@ def add_stage_options(add: Callable, stage: str, *names: str) -> None:
         )
 
 
-def stage_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+def stage_options(options: argparse.Namespace, *names: str) -> JsonObject:
     """Return the options of a stage that were set by flags of :func:`add_stage_options`."""
     return {name: value for name in names if (value := getattr(options, name)) is not None}

@@ -15,7 +15,6 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 from ..base.errors import OptionError, suggest
 
@@ -165,7 +164,7 @@ def preset_dimensions(spec: str | Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for names in used for name in names))
 
 
-def split_words(spec: Any, what: str = "neighborhoods") -> list[str]:
+def split_words(spec: object, what: str = "neighborhoods") -> list[str]:
     """Return the words of text or a list of text, in lower case; OptionError for something else."""
     if isinstance(spec, str):
         # A comma inside parentheses belongs to the token.

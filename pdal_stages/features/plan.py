@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from ..base.errors import OptionError, suggest
+from ..base.json_types import JsonObject
 from . import gap_below, return_features
 from .neighborhoods import (
     AROUND,
@@ -196,7 +196,7 @@ class FeaturePlan:
         """True where a neighborhood is curvature-adaptive, so that its threshold is needed."""
         return any(c.at and c.neighborhood.kind == "copt" for c in self.layout)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return a JSON-able description; :meth:`from_dict` reads it."""
         return {
             "neighborhoods": [n.token for n in self.neighborhoods],
@@ -205,7 +205,7 @@ class FeaturePlan:
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> FeaturePlan:
+    def from_dict(cls, data: JsonObject) -> FeaturePlan:
         """Return the plan that :meth:`to_dict` described; OptionError for unknown words."""
         if data.get("least_members", RADIUS_MEMBERS) != RADIUS_MEMBERS:  # of earlier versions
             raise OptionError(f"'least_members' of a feature plan must be {RADIUS_MEMBERS}")

@@ -40,6 +40,7 @@ import numpy as np
 from ..base.errors import OptionError
 from ..base.hashing import GOLDEN, finalize
 from ..base.jit import device, njit
+from ..base.json_types import JsonObject
 from .plan import Columns, columns_of
 from .registry import MOMENT_FEATURES, SHAPE_BINS, SHAPE_FEATURES, SHAPES, rows_of
 
@@ -111,7 +112,7 @@ class ShapeBins:
         lengths below 0.
     """
 
-    def __init__(self, thresholds: Mapping[str, Any]) -> None:
+    def __init__(self, thresholds: JsonObject) -> None:
         self._thresholds = {token: np.array(rows, float) for token, rows in thresholds.items()}
         for token, rows in self._thresholds.items():
             if not (
@@ -163,7 +164,7 @@ class ShapeBins:
         rows = zip(METRIC_NAMES, self.thresholds(token), strict=True)
         return np.array([COMPARABLE[name][0](row) for name, row in rows], np.float32)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return ``{"c1": {"A3": [INNER numbers], "D1": ...}, ...}``, JSON-able and exact."""
         return {
             token: dict(zip(METRIC_NAMES, rows.tolist(), strict=True))
@@ -171,7 +172,7 @@ class ShapeBins:
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> ShapeBins:
+    def from_dict(cls, data: JsonObject) -> ShapeBins:
         """Return the bins that :meth:`to_dict` described; OptionError for another description."""
         try:
             return cls({t: [rows[name] for name in METRIC_NAMES] for t, rows in data.items()})

@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.vector import vector
 from .results import ObjectTable
+
+if TYPE_CHECKING:
+    from shapely import MultiPolygon, Polygon
+
+    Polygonal: TypeAlias = Polygon | MultiPolygon
 
 
 @dataclass(frozen=True)
@@ -45,13 +51,15 @@ class OutlineRules:
 RULES = OutlineRules()
 
 
-def raw_outlines(table: ObjectTable, size: float, *, hole: float = RULES.min_hole) -> list[Any]:
+def raw_outlines(
+    table: ObjectTable, size: float, *, hole: float = RULES.min_hole
+) -> list[Polygonal]:
     """Return the union of each object's cells; holes smaller than `hole` m2 are closed."""
     shapely = vector("shapely")
     return [_polygon(shapely, row, column, hole / size**2) for row, column, _ in table.cells]
 
 
-def _polygon(shapely: Any, row: NDArray, column: NDArray, hole: float) -> Any:
+def _polygon(shapely: ModuleType, row: NDArray, column: NDArray, hole: float) -> Polygonal:
     """Return the polygon of cells in ascending rows, without holes smaller than `hole` cells."""
     begins = np.flatnonzero(np.r_[True, (np.diff(column) != 1) | (np.diff(row) != 0)])
     ends = np.r_[begins[1:], len(row)] - 1
@@ -63,7 +71,7 @@ def _polygon(shapely: Any, row: NDArray, column: NDArray, hole: float) -> Any:
     return parts[0] if len(parts) == 1 else shapely.union_all(parts)
 
 
-def straight_outlines(raw: list[Any]) -> list[Any]:
+def straight_outlines(raw: list[Polygonal]) -> list[Polygonal]:
     """Return outlines along walls.
 
     Parameters
@@ -88,7 +96,7 @@ def straight_outlines(raw: list[Any]) -> list[Any]:
     return out
 
 
-def _is_faithful(shapely: Any, outline: Any, shape: Any) -> bool:
+def _is_faithful(shapely: ModuleType, outline: Polygonal, shape: Polygonal) -> bool:
     """Return whether an outline is valid and overlaps the shape enough."""
     if not outline.is_valid:
         return False
@@ -96,7 +104,7 @@ def _is_faithful(shapely: Any, outline: Any, shape: Any) -> bool:
     return bool(shared >= RULES.min_iou * (outline.area + shape.area - shared))
 
 
-def _straighten(shapely: Any, simple: Any, shape: Any) -> Any:
+def _straighten(shapely: ModuleType, simple: Polygonal, shape: Polygonal) -> Polygonal:
     """Return a simplified polygon with its corners moved so that walls are straight."""
     rings = shapely.get_rings(simple)
     corners, number = np.unique(shapely.get_coordinates(rings), axis=0, return_inverse=True)
@@ -117,7 +125,7 @@ def _straighten(shapely: Any, simple: Any, shape: Any) -> Any:
     return shapely.simplify(out[0], RULES.corner_tolerance)
 
 
-def _segments(shapely: Any, rings: NDArray, values: NDArray) -> NDArray:
+def _segments(shapely: ModuleType, rings: NDArray, values: NDArray) -> NDArray:
     """Return the values (n, 2, ...) at both ends of all segments of rings.
 
     `values` (m, ...) belong to the coordinates of the rings.
@@ -189,7 +197,7 @@ def main_direction(walls: NDArray) -> float:
     return float(angles[np.argmin(np.round(extents, 6)), 0])
 
 
-def crown_outlines(raw: list[Any]) -> list[Any]:
+def crown_outlines(raw: list[Polygonal]) -> list[Polygonal]:
     """Return outlines of crowns with smoother edges, which neighbors share."""
     shapely = vector("shapely")
     if not raw:

@@ -14,7 +14,7 @@ from ..base.dimensions import HEIGHT
 from ..base.errors import ModelError, OptionError, suggest
 from ..base.json_types import StageJson
 from ..base.selections import split_selection
-from ..classifier.model import loaded_model
+from ..classifier.model import Model, loaded_model
 from ..classifier.model_file import STANDARD
 from ..stages import preprocessing
 from ..stages.points import SELECTED
@@ -42,7 +42,7 @@ class ClassifyRequest:
     #: Created dimensions to write besides the input's own; ``all`` and ``none`` are allowed.
     dimensions: tuple[str, ...] = WRITTEN
     #: options of ``filters.modelclassifier``, such as ``keep_sure`` and ``vegetation_heights``
-    classifier_options: Mapping[str, Any] = field(default_factory=dict)
+    classifier_options: Mapping[str, object] = field(default_factory=dict)
     noise: bool = True  #: mark low and high noise first
     towers: bool = True  #: find what holds wires, where the model has these
     bridges: bool = False  #: find bridge decks, where heights are those of `_GROUND`
@@ -83,7 +83,7 @@ class ClassifyRequest:
         return stage.limits.describe_cost(dict(stage.model.classes))
 
     @cached_property
-    def loaded(self) -> Any:
+    def loaded(self) -> Model:
         """The model that will be applied, after overrides."""
         return loaded_model(self._settled["model"])
 

@@ -3,11 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..base.distinct import Box, DistinctPoints, overlaps_of, take_first
 from ..base.las import header_there
 from .workers import each_file
+
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class _FileTask(Generic[_Result]):
+    """Read a file."""
+
+    function: Callable[..., _Result]  #: gets `work`, and which points are distinct
+    work: tuple
+    number: int  #: of the file
+    overlaps: Sequence[Box]  #: where other files may have the same points
+    taken: NDArray[np.uint64] | None = None  #: keys of points that came before
+
+
+@dataclass(frozen=True)
+class _FileResult(Generic[_Result]):
+    """What was read of a file."""
+
+    number: int  #: of the file
+    result: _Result
+    shared: NDArray[np.uint64]  #: keys of points that other files may have
+    repeated: int  #: points that are left out
 
 
 class DistinctFiles:
@@ -21,8 +48,8 @@ class DistinctFiles:
         self.repeated: dict[str, int] = {}  #: points that are left out, by file; once read
 
     def results(
-        self, function: Callable[..., Any], work: Sequence[tuple], workers: int
-    ) -> Iterator[Any]:
+        self, function: Callable[..., _Result], work: Sequence[tuple], workers: int
+    ) -> Iterator[_Result]:
         """Yield `function(*item, distinct)` for the item of work of each file, in any order.
 
         The function leaves out what :meth:`DistinctPoints.first` does not return; see
@@ -30,25 +57,27 @@ class DistinctFiles:
         """
         headers = [header_there(path) for path in self.files]
         overlaps = overlaps_of([header.box if header else None for header in headers])
-        tasks = [(function, item, n, overlaps[n], None) for n, item in enumerate(work)]
-        waiting: dict[int, tuple[Any, Any]] = {}
-        for number, result, keys in self._read(tasks, workers):
-            if overlaps[number]:
-                waiting[number] = result, keys
+        tasks = [_FileTask(function, item, n, overlaps[n]) for n, item in enumerate(work)]
+        waiting: dict[int, _FileResult[_Result]] = {}
+        for each in self._read(tasks, workers):
+            if overlaps[each.number]:
+                waiting[each.number] = each
             else:
-                yield result
+                yield each.result
         numbers = sorted(waiting)
-        taken = dict(zip(numbers, take_first([waiting[n][1] for n in numbers]), strict=True))
-        yield from (waiting[number][0] for number in numbers if not len(taken[number]))
-        again = [(*tasks[n][:4], taken[n]) for n in numbers if len(taken[n])]
+        taken = dict(zip(numbers, take_first([waiting[n].shared for n in numbers]), strict=True))
+        yield from (waiting[number].result for number in numbers if not len(taken[number]))
+        again = [replace(tasks[n], taken=taken[n]) for n in numbers if len(taken[n])]
         waiting.clear()
         if again:
-            yield from (result for _, result, _ in self._read(again, workers))
+            yield from (each.result for each in self._read(again, workers))
 
-    def _read(self, tasks: Sequence[tuple], workers: int) -> Iterator[tuple[int, Any, Any]]:
-        for number, result, keys, repeated in each_file(_read_file, tasks, workers):
-            self.repeated[self.files[number]] = repeated
-            yield number, result, keys
+    def _read(
+        self, tasks: Sequence[_FileTask[_Result]], workers: int
+    ) -> Iterator[_FileResult[_Result]]:
+        for each in each_file(_read_file, [(task,) for task in tasks], workers):
+            self.repeated[self.files[each.number]] = each.repeated
+            yield each
 
     @property
     def messages(self) -> list[str]:
@@ -64,10 +93,8 @@ class DistinctFiles:
         ]
 
 
-def _read_file(
-    function: Callable[..., Any], item: tuple, number: int, overlaps: Sequence[Box], taken: Any
-) -> tuple[int, Any, Any, int]:
-    """Return a file's number, its result, the keys that others may have, and points left out."""
-    distinct = DistinctPoints(taken, overlaps)
-    result = function(*item, distinct)
-    return number, result, distinct.shared, distinct.repeated
+def _read_file(task: _FileTask[_Result]) -> _FileResult[_Result]:
+    """Read a file."""
+    distinct = DistinctPoints(task.taken, task.overlaps)
+    result = task.function(*task.work, distinct)
+    return _FileResult(task.number, result, distinct.shared, distinct.repeated)

@@ -8,9 +8,8 @@ from __future__ import annotations
 import glob
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from ..base.errors import PipelineError, StageError, optional_import, suggest
 from ..base.files import LAS, Output
@@ -197,7 +196,7 @@ def named_files(stages: Sequence[StageJson]) -> list[str]:
     return files
 
 
-def _texts(value: Any) -> Iterator[str]:
+def _texts(value: object) -> Iterator[str]:
     """Yield all texts in an option's value."""
     if isinstance(value, str):
         yield value
@@ -230,7 +229,7 @@ def writers_outputs(stages: list[StageJson]) -> list[Output]:
     return [Output(s["filename"], "output", LAS if writes_las(s) else "") for s in writers]
 
 
-def with_outputs(stages: list[StageJson], names: list[Any]) -> list[StageJson]:
+def with_outputs(stages: list[StageJson], names: Iterable[object]) -> list[StageJson]:
     """Return the stages with other names for the files that writers write."""
     waiting = iter(names)
     return [{**s, "filename": str(next(waiting))} if is_writer(s) else s for s in stages]

@@ -16,9 +16,10 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from types import ModuleType
 from typing import Any
 
 from ..base.errors import DependencyError, PipelineError
@@ -45,7 +46,7 @@ class Execution:
     log: str = ""
 
 
-def bindings() -> Any:
+def bindings() -> ModuleType:
     """Return the module `pdal`; DependencyError with the cure where it is absent or broken."""
     try:
         import pdal
@@ -76,9 +77,13 @@ def program() -> str:
     raise DependencyError("the program 'pdal' is not on PATH", cure=INSTALL)
 
 
-def _run_program(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+def _run_program(
+    *arguments: str, timeout: float, input: str | None = None
+) -> subprocess.CompletedProcess[str]:
     command = [program(), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=timeout, input=input
+    )
 
 
 def ask_program(*arguments: str) -> str:
@@ -113,7 +118,9 @@ def writer_of(target: str) -> StageJson:
     return stage
 
 
-def with_types(stages: Sequence[Any], where: Callable[[int], str] | None = None) -> list[StageJson]:
+def with_types(
+    stages: Sequence[object], where: Callable[[int], str] | None = None
+) -> list[StageJson]:
     """Return stages as objects with the types that PDAL infers from file names.
 
     Readers of LAS read extra dimensions of all versions.
@@ -207,10 +214,10 @@ def _execute(stages: list[StageJson], arrays: bool, loglevel: int) -> Execution:
 _BY_PROGRAM = re.compile(
     r"^\((?:pypipeline|pdal pipeline)\s+(\S+?)\s+\w+\)\s*(?:\1:\s*)?", re.IGNORECASE
 )
-_kept_alive: dict[int, Any] = {}
+_kept_alive: dict[int, object] = {}
 
 
-def keep_alive(stdout: Any) -> None:
+def keep_alive(stdout: object) -> None:
     """Keep a sys.stdout after a script failed: PDAL borrows the reference until a run succeeds."""
     _kept_alive[id(stdout)] = stdout
 
@@ -308,7 +315,7 @@ def splits_class_flags() -> bool:
     return "Withheld" in {dimension["name"] for dimension in bindings().dimensions}
 
 
-def flags_inside_classification(dimensions: Any, metadata: Any) -> bool:
+def flags_inside_classification(dimensions: Container[str], metadata: object) -> bool:
     """Return whether flag bits of LAS 1.0-1.3 sit inside `Classification`, as before PDAL 2.6.
 
     Newer versions have a dimension for each flag; LAS 1.4 formats have `ClassFlags`.
@@ -317,7 +324,7 @@ def flags_inside_classification(dimensions: Any, metadata: Any) -> bool:
     return max(point_formats(metadata), default=6) <= 5 and not any(f in dimensions for f in flags)
 
 
-def overlap_as_flag(dimensions: Any, metadata: Any) -> bool:
+def overlap_as_flag(dimensions: Container[str], metadata: object) -> bool:
     """Return whether class 12 (overlap) of LAS 1.0-1.3 is class 0 with the flag Overlap (2.6 on).
 
     Files of LAS 1.4 have both the class and the flag: there class 0 with the flag is a point not
@@ -326,12 +333,12 @@ def overlap_as_flag(dimensions: Any, metadata: Any) -> bool:
     return "Overlap" in dimensions and min(point_formats(metadata), default=6) <= 5
 
 
-def point_formats(metadata: Any) -> list[int]:
+def point_formats(metadata: object) -> list[int]:
     """Return the point data record formats of the files that were read, from PDAL's metadata."""
-    return [int(v) for v in _values(metadata, "dataformat_id") if str(v).isdigit()]
+    return [int(v) for v in map(str, _values(metadata, "dataformat_id")) if v.isdigit()]
 
 
-def _values(node: Any, name: str) -> list[Any]:
+def _values(node: object, name: str) -> list[object]:
     """Return all values of a name in metadata: nodes in filters.python, a dict in a pipeline."""
     if isinstance(node, list):
         return [value for child in node for value in _values(child, name)]

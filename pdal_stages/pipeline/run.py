@@ -197,7 +197,7 @@ class Pipeline:
         wkt: str,
         known: Mapping[str, NDArray] | None = None,
         after: Callable[[runtime.ExpandedStage, Mapping[str, NDArray]], None] | None = None,
-    ) -> ChainMap[str, Any]:
+    ) -> ChainMap[str, NDArray]:
         """Run its stages without PDAL; see :func:`.copies.run_stages`."""
         for ours in self.expanded.ours:
             ours.reports = []
@@ -405,5 +405,5 @@ def _named_metadata(metadata: JsonObject, expanded: Expanded) -> JsonObject:
     return metadata
 
 
-def _as_list(node: Any) -> list[Any]:
+def _as_list(node: object) -> list[object]:
     return node if isinstance(node, list) else [node]

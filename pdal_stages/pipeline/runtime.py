@@ -273,7 +273,7 @@ def reader_metadata(metadata: JsonObject) -> JsonObject:
     return node[0] if isinstance(node, list) else node
 
 
-def wkt_of(reference: Any) -> str:
+def wkt_of(reference: object) -> str:
     """Return the well-known text in PDAL's description of a spatial reference."""
     srs = reference.get("srs", reference) if isinstance(reference, dict) else None
     if not isinstance(srs, dict):
@@ -291,7 +291,7 @@ def leaves(report: Report) -> list[StageJson]:
     return [leaf(key, value) for key, value in report.to_dict().items() if value is not None]
 
 
-def leaf(name: str, value: Any) -> JsonObject:
+def leaf(name: str, value: object) -> JsonObject:
     """Return one value as a node of PDAL's metadata: its text and type."""
     if isinstance(value, str):
         return node(name, [], _encodable(value), "string")
@@ -351,7 +351,7 @@ class Callbacks:
         """
         condition = Expression(where)
 
-        def mark(module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+        def mark(module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
             seen = {name: values for name, values in ins.items() if name not in unknown}
             if pdal_env.flags_inside_classification(ins, module.get("metadata")):
                 seen["Classification"] = seen["Classification"] & np.uint8(LEGACY_LIMIT)

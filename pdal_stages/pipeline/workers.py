@@ -30,7 +30,7 @@ _one_task = threading.Lock()
 
 
 #: What a worker calls; its result is :attr:`TaskResult.result`.
-Task = Callable[[], Any]
+Task = Callable[[], object]
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
@@ -75,10 +75,10 @@ class Workers(Protocol):
     slots: int  #: tasks at the same time
     threads: int  #: threads of each task
 
-    def submit(self, task: Task) -> Any:
+    def submit(self, task: Task) -> Future:
         """Send a task to a free worker; return what stands for its result."""
 
-    def wait(self, futures: Iterable[Any]) -> set[Any]:
+    def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one; return those that are done."""
 
 
@@ -178,7 +178,7 @@ def run_tasks(
     Items may be added after every result. `task_of` is called for an item's task just before it is
     sent.
     """
-    running: dict[Any, _Item] = {}
+    running: dict[Future, _Item] = {}
     while waiting or running:
         while waiting and len(running) < workers.slots:
             item = waiting.popleft()
@@ -187,7 +187,7 @@ def run_tasks(
             yield running.pop(future), _result_of(future)
 
 
-def _result_of(future: Any) -> TaskResult:
+def _result_of(future: Future) -> TaskResult:
     """Return the result of a task that is done, or why there is none."""
     error = future.exception()
     if error is None:

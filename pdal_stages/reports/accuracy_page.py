@@ -162,7 +162,7 @@ def _templates() -> Environment:
     return environment
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+def flat(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, str]]:
     """Return names and values as text: nested mappings get dotted names, numbers six digits."""
     out: list[tuple[str, str]] = []
     for key, value in values.items():
@@ -173,7 +173,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     return out
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if isinstance(value, Mapping | list | tuple | set | frozenset):
         return ", ".join(map(_text, value)) or "none"
     if isinstance(value, float):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from ..objects.outlines import RULES as OUTLINE_RULES
 from ..objects.outlines import crown_outlines, raw_outlines, straight_outlines
 from ..objects.results import Objects, ObjectTable
 from .vector_files import Layer, qml, write_layers
+
+if TYPE_CHECKING:
+    from ..objects.outlines import Polygonal
 
 #: Layers of objects, in this order.
 LAYERS = ("buildings", "trees", "crowns", "spans", "decks")
@@ -67,7 +70,7 @@ def object_layers(
     horizontal, vertical = units.horizontal, units.vertical
     columns = {kind: _columns(table, kind, units) for kind, table in tables.items()}
 
-    def polygons(shapes: list[Any], kind: Kind) -> Layer:
+    def polygons(shapes: list[Polygonal], kind: Kind) -> Layer:
         """Return shapes in the coordinates' unit, to a thousandth where that keeps them valid."""
         exact = [shapely.transform(shape, lambda xy: xy * (size / horizontal)) for shape in shapes]
         rounded = [shapely.transform(shape, lambda xy: np.round(xy, 3)) for shape in exact]

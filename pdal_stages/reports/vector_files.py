@@ -7,7 +7,7 @@ import html
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from ..base.errors import StageError
 from ..base.files import check_writable, whole_files
 from ..base.vector import horizontal_wkt, refuse_odd_name, vector
+
+if TYPE_CHECKING:
+    from shapely import Geometry
 
 #: GDAL's drivers by the ending of a file's name.
 DRIVERS = {
@@ -30,7 +33,7 @@ MANY_LAYERS = "GPKG"
 class Layer(NamedTuple):
     """Shapes of one type with their attributes."""
 
-    shapes: list[Any]  #: shapely geometries
+    shapes: list[Geometry]
     kind: str  #: their type, as GDAL names it
     columns: dict[str, NDArray]  #: a value for each shape, by name
 

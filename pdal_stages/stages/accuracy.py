@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +91,7 @@ class AccuracyStage(Stage):
 
     @classmethod
     def from_pipeline(
-        cls, raw_options: Mapping[str, Any], before: Sequence[StageJson]
+        cls, raw_options: Mapping[str, object], before: Sequence[StageJson]
     ) -> JsonObject:
         """Return options that follow from the stages before."""
         taken: JsonObject = {"files": files_read(before)}

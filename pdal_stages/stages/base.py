@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -189,13 +190,15 @@ class Stage(ABC):
     #: holds them.
     upstream: tuple[StageJson, ...] = ()
 
-    def __init_subclass__(cls, settings: Any = None) -> None:
+    def __init_subclass__(cls, settings: builtins.type | None = None) -> None:
         """Declare the fields of `settings` as options, but those that the class has already."""
-        for field in fields(settings) if settings is not None else ():
+        if settings is None:
+            return
+        for field in fields(settings):
             if field.metadata and not hasattr(cls, field.name):
                 setattr(cls, field.name, option_of(settings, field.name))
 
-    def __init__(self, raw_options: Mapping[str, Any], place: str | None = None) -> None:
+    def __init__(self, raw_options: Mapping[str, object], place: str | None = None) -> None:
         self.place = place or self.type
         try:
             raw_options = self.complete(decode_options(self.all_options(), raw_options))
@@ -212,7 +215,7 @@ class Stage(ABC):
             raise error.prefixed(self.place) from None
         self._frozen = True
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         """Refuse to change a stage after it is made."""
         if "_frozen" in self.__dict__:
             raise AttributeError(f"a stage cannot be changed after it is made: '{name}' is set")
@@ -240,7 +243,7 @@ class Stage(ABC):
         return {name: each for body in bodies for name, each in body if isinstance(each, Count)}
 
     @classmethod
-    def complete(cls, raw_options: dict[str, Any]) -> JsonObject:
+    def complete(cls, raw_options: JsonObject) -> JsonObject:
         """Return the options of a user with those that a word among them stands for."""
         return raw_options
 
@@ -334,7 +337,7 @@ class Stage(ABC):
 
     @classmethod
     def from_pipeline(
-        cls, raw_options: Mapping[str, Any], before: Sequence[StageJson]
+        cls, raw_options: Mapping[str, object], before: Sequence[StageJson]
     ) -> JsonObject:
         """Return options that follow from the stages before, where the user does not set them."""
         return {}

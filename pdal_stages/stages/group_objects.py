@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..base.dimensions import OBJECT_ID, Dimension
 from ..base.errors import StageError
+from ..base.json_types import JsonObject
 from ..objects.cells import (
     CLASSES,
     MIN_POINTS_PER_CELL,
@@ -51,7 +52,7 @@ class ObjectOptions:
     decks: list[int] = _codes("decks", "bridge decks")
     ignore: Selection = ignore_option("Points that belong to no object")
 
-    options: dict[str, Any]
+    options: JsonObject
 
     @cached_property
     def settings(self) -> ObjectSettings:

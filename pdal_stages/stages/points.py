@@ -6,7 +6,7 @@ from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -301,7 +301,7 @@ class Points:
         """Return class codes (n,) with each point's flag bits, and count codes in the report."""
         self.report.codes = class_counts(codes)
         limit = self.code_limit
-        flags: Any = np.uint8(0)
+        flags: np.uint8 | NDArray[np.uint8] = np.uint8(0)
         if self.legacy_flags:
             flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
             if flags.any():

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -81,7 +80,7 @@ def same(first: Sequence[StageJson], second: Sequence[StageJson]) -> bool:
     return _normalize(first) == _normalize(second)
 
 
-def _normalize(stages: Sequence[StageJson]) -> list[Any]:
+def _normalize(stages: Sequence[StageJson]) -> list[StageJson]:
     """Return the stages in one spelling where a model could carry them, else as they are."""
     try:
         return check(stages)
@@ -137,7 +136,7 @@ def _check_stage(stage: StageJson) -> StageJson:
     return {"type": kind, **values}
 
 
-def _value(option: Option, value: Any) -> Any:
+def _value(option: Option, value: object) -> object:
     """Return an option's value in the spelling of JSON."""
     parsed = option.parse(value)
     if option.kind == "selection":

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,13 +99,13 @@ class TrainModel(Stage, settings=TrainingOptions):
         )
 
     @classmethod
-    def complete(cls, raw_options: dict[str, Any]) -> JsonObject:
+    def complete(cls, raw_options: JsonObject) -> JsonObject:
         """Return the options with those of the recipe that they name."""
         return with_recipe(raw_options)
 
     @classmethod
     def from_pipeline(
-        cls, raw_options: Mapping[str, Any], before: Sequence[StageJson]
+        cls, raw_options: Mapping[str, object], before: Sequence[StageJson]
     ) -> JsonObject:
         """Return options that follow from the stages before."""
         return {"files": files_read(before)}

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,7 +161,7 @@ def fill(
     # Morphological closing with a disk: cells between others, not those beyond the last.
     between = (_distance_to(_distance_to(known) > reach) > reach)[inner] & empty & ~level
     if between.any():
-        gdal_fill: Any = optional_import("rasterio.fill", "raster", "a surface model")
+        gdal_fill = optional_import("rasterio.fill", "raster", "a surface model")
         all_heights = gdal_fill.fillnodata(height.astype(np.float32), known, reach)
         out[between] = all_heights[inner][between]
     return np.where(np.isnan(out), np.nan, np.fmax(out, terrain))

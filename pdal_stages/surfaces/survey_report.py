@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,7 +127,7 @@ def _measure(
     settings = {**asdict(rules), "places": places.tolist()}
     reduce = partial(reduce_tile, rules=rules, control=places)
     jobs = run.reduce("report", settings, reduce, ReportFigures)
-    files: dict[str, list[Any]] = {}
+    files: dict[str, list[JsonObject]] = {}
     for path, described in (item for job in jobs for item in job.figures.files.items()):
         files.setdefault(path, []).append(described)
     by_file = {path: combine(files[path]) for path in survey.paths if path in files}

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ def triangulate(xy: Integers) -> Integers:
 
 def _any_triangles(xy: Integers) -> Integers:
     """Return triangles (m, 3) of an exact Delaunay triangulation of points (n, 2)."""
-    startinpy: Any = optional_import("startinpy", "raster", "a terrain model")
+    startinpy = optional_import("startinpy", "raster", "a terrain model")
     network = startinpy.DT()
     network.snap_tolerance = 1e-6
     if len(xy) >= 3:

@@ -65,11 +65,15 @@ JUDGED = ("HeightAboveProvisional", "GroundTolerance")
 PLACED = ("Piece", "CellColumn", "CellRow")
 
 
+#: Indices of points, which of them, or a slice.
+Rows = NDArray[np.int64] | NDArray[np.bool_] | slice
+
+
 class _Piece(NamedTuple):
     """A piece of a cloud and the surface through its ground."""
 
-    rows: Any  #: indices of its points, and of those around that matter; or a slice
-    core: Any  #: which of these belong to the piece, or a slice
+    rows: Rows  #: its points, and those around that matter
+    core: Rows  #: which of these belong to the piece
     points: GroundPoints
     raster: GroundRaster
 
@@ -134,7 +138,7 @@ def filtered_ground(
     return out if finite.all() else {k: spread(v, rows, len(x)) for k, v in out.items()}
 
 
-def spread(values: NDArray, rows: Any, count: int) -> NDArray:
+def spread(values: NDArray, rows: Rows, count: int) -> NDArray:
     """Return the values of some rows among `count`; NaN, or 0 for whole numbers, elsewhere."""
     whole = np.full(count, np.nan if values.dtype.kind == "f" else 0, values.dtype)
     whole[rows] = values
@@ -194,7 +198,7 @@ def _cut_to(core: GridWindow, keep: Keep | None) -> Keep | None:
     return None if keep is None else cut
 
 
-def _window_of(points: GroundPoints, rows: Any = slice(None)) -> GridWindow:
+def _window_of(points: GroundPoints, rows: Rows = slice(None)) -> GridWindow:
     """Return the window of the cells of some points."""
     return GridWindow.enclosing(points.column[rows], points.row[rows])
 

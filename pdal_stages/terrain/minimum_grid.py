@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,8 @@ def minimum_grid(points: GroundPoints, window: GridWindow, cell: float) -> Groun
     All of them are ground, until later steps find objects. `cell` is the side of a cell in meters.
     """
     use = points.use & window.contains(points.column, points.row)
-    usable: Any = slice(None) if use.all() else np.flatnonzero(use)  # no copy of all points
+    # A slice makes no copy of all points.
+    usable: slice | NDArray[np.int64] = slice(None) if use.all() else np.flatnonzero(use)
     x, y, z, _, column, row = points.take(usable)
     inside = window.flat_index(column, row)
     low = lowest_points(x, y, z, inside, window.width * window.height).reshape(window.shape)

@@ -11,7 +11,6 @@ logarithm of its radius.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +66,7 @@ def highest_around(
     return out
 
 
-def _highest_of_rows(raster: NDArray, least: Any, squares: int, diamonds: int) -> NDArray:
+def _highest_of_rows(raster: NDArray, least: float, squares: int, diamonds: int) -> NDArray:
     """Return the maximum (h, w) around each cell of some rows; outside them is the `least` value.
 
     Each line of an octagon is a running maximum on the flat raster with a margin round it, by

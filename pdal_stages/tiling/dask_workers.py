@@ -7,14 +7,13 @@ import os
 import pickle
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any
 
 from ..base.errors import StageError, optional_import
 from ..base.version import build
 from ..pipeline import pdal as pdal_env
-from ..pipeline.workers import TaskResult, perform_task
+from ..pipeline.workers import Task, TaskResult, perform_task
 
 #: Seconds to wait for the scheduler.
 _CONNECT = 10.0
@@ -33,7 +32,7 @@ class Cluster(contextlib.AbstractContextManager):
 
     def __enter__(self) -> Cluster:
         """Connect, and wait for the first worker."""
-        dask: Any = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
+        dask = optional_import("distributed", "dask", "a Dask scheduler (--scheduler)")
         try:
             self._client = dask.Client(self.address, timeout=_CONNECT, set_as_default=False)
         except (OSError, ValueError) as error:  # ValueError: an address of another kind
@@ -63,7 +62,7 @@ class Cluster(contextlib.AbstractContextManager):
             self._executor.shutdown(wait=False)
         self._client.close()
 
-    def submit(self, task: Callable[[], Any]) -> Future:
+    def submit(self, task: Task) -> Future:
         """Send a task, as bytes so that Dask does not search it for its own keys."""
         host, work = socket.gethostname(), pickle.dumps(task)
         try:

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,7 +152,7 @@ class InputSource:
         return self.index.box if self.index and self.index.count else self.extent.box
 
     @property
-    def content(self) -> list[Any]:
+    def content(self) -> list[object]:
         """Its name, reader and digest; size and time before it was read."""
         return [self.path, self.reader, self.index.digest if self.index else self.stamp]
 
@@ -163,7 +162,7 @@ def find_sources(readers: list[StageJson]) -> list[InputSource]:
     sources: dict[str, InputSource] = {}
     for reader in readers:
         options = {k: v for k, v in reader.items() if k not in ("filename", "tag", "inputs")}
-        name: Any = reader.get("filename", "")
+        name = reader.get("filename", "")
         if reader["type"] == "readers.tindex":
             paths = locations(str(name), str(options.get("tindex_name", "location")))
             options = {k: v for k, v in options.items() if k in ("override_srs", "default_srs")}
@@ -351,7 +350,7 @@ class Survey:
             for path, before in self._others.items()
         }
 
-    def stamps_of(self, files: Sequence[Sequence[str]]) -> list[Any]:
+    def stamps_of(self, files: Sequence[Sequence[str]]) -> list[object]:
         """Return names and contents (digests) of files that stages read."""
         return [[path, self._contents[path]] for each in files for path in each]
 
@@ -439,7 +438,7 @@ def one_format(paths: Sequence[str]) -> StageJson:
     a centimeter and point format 3. Unreadable inputs are reported later.
     """
     headers = [header for path in paths if (header := las.header_there(path)) and header.count]
-    options: dict[str, Any] = {}
+    options: StageJson = {}
     formats = {header.point_format for header in headers}
     if len(formats) > 1:
         colored = 8 if 8 in formats else 7 if formats & {2, 3, 7} else 6

@@ -7,12 +7,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any
 
 from ..base.hashing import fingerprint
 from ..base.messages import Message
 from ..base.version import build
-from ..pipeline.workers import Workers
+from ..pipeline.workers import Task, Workers
 from .inputs import Survey
 from .jobs import OutputJob, Store, TiledRun, TileJob, WritingJob, messages_of, summarize
 from .plan import RunContext, TilePlan, outputs_for
@@ -159,7 +158,7 @@ class PlanRun(SurveyRun):
             for job in out.needs:
                 users.setdefault(job.name, []).append(out)
 
-        def task_of(job: WritingJob) -> Callable[[], Any]:
+        def task_of(job: WritingJob) -> Task:
             if isinstance(job, TileJob):
                 return self.tile_task(len(self.plan.rounds) - 1, job)
             assert job.outputs is not None
@@ -174,7 +173,7 @@ class PlanRun(SurveyRun):
             for out in users.get(job.name, ()):
                 _make_ready(out, waiting)
 
-    def tile_task(self, number: int, job: TileJob) -> Callable[[], Any]:
+    def tile_task(self, number: int, job: TileJob) -> Task:
         """Return the task that runs a round on a tile or square."""
         survey = self.survey
         box = self.context.grid_of(number).box(job.tile, self.farthest)

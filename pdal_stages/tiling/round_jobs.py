@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
 
 from ..base.hashing import fingerprint
 from ..base.version import build
+from ..pipeline.workers import Task
 from .earlier_rounds import block_name, blocks_near, make_block, square_name
 from .jobs import BlockJob, TileJob
 from .options import Box, TileGrid
@@ -115,7 +114,7 @@ class RoundJobs:
         name = square_name(self.run.context, number, square)
         return TileJob(name, self._points_of_squares[square], square, digest=digest)
 
-    def _block_task(self, job: BlockJob) -> Callable[[], Any]:
+    def _block_task(self, job: BlockJob) -> Task:
         """Return the task that computes a block."""
         squares = [self.run.store.path(each.name) for each in job.needs]
         return partial(

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from ..base.asprs import LEGACY_LIMIT
 from ..base.columns import SomeRows
 from ..base.distinct import count_shared
 from ..base.errors import NoTerrainError, PipelineError
-from ..base.json_types import StageJson
+from ..base.json_types import JsonObject, StageJson
 from ..base.las_copy import LasCopy
 from ..base.las_points import LasColumns
 from ..base.messages import Message, Topic
@@ -222,7 +222,7 @@ class _RoundRun:
             self._measure_reach(expanded.number, module, seen, {})
 
     def _measure_reach(
-        self, place: int, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
+        self, place: int, module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
     ) -> None:
         """Ask an open-ended stage which halo it needs."""
         expanded = self.expanded[place]
@@ -230,7 +230,9 @@ class _RoundRun:
         box = [side * points.units.horizontal for side in self._box()]
         self.needs_m.append(expanded.stage.reach_of(points, expanded.context, box))
 
-    def _take(self, module: Any, ins: Mapping[str, NDArray], outs: dict[str, NDArray]) -> None:
+    def _take(
+        self, module: JsonObject, ins: Mapping[str, NDArray], outs: dict[str, NDArray]
+    ) -> None:
         """Take the results of the tile's own points, and reduce these for blocks."""
         part = self.context.plan.rounds[self.number]
         wanted = self.context.plan.creates if self._is_last else part.saved

@@ -7,14 +7,14 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from ..base import las_check
 from ..base.errors import StageError, WriteError
 from ..base.hashing import fingerprint
 from ..base.messages import Message
 from ..base.progress import Progress
-from ..pipeline.workers import ThisProcess, WorkerProcesses, Workers, run_tasks
+from ..pipeline.workers import Task, ThisProcess, WorkerProcesses, Workers, run_tasks
 from .inputs import CloudIndex, Survey
 from .jobs import InputJob, Job, OutputJob, Store
 from .options import TilingOptions
@@ -46,7 +46,7 @@ class SurveyRun:
         self.peak_mb = 0.0  #: peak memory of a process
 
     def do(
-        self, what: str, waiting: deque[_Job], task_of: Callable[[_Job], Callable[[], Any]]
+        self, what: str, waiting: deque[_Job], task_of: Callable[[_Job], Task]
     ) -> Iterator[_Job]:
         """Run jobs as workers become free, save their records, and yield each.
 
@@ -101,7 +101,7 @@ class SurveyRun:
             assert source.extent is not None
             waiting.append(InputJob(name, source.extent.count, source=source))
 
-        def task_of(job: InputJob) -> Callable[[], Any]:
+        def task_of(job: InputJob) -> Task:
             copy = str(store.scratch / f"{job.name}.points")
             return partial(sort_points, job.source.path, survey.grid, survey.lone_grid, copy)
 

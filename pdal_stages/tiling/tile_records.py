@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,7 +208,7 @@ class RecordRun(SurveyRun):
         self,
         name: str,
         points: Mapping[Tile, int],
-        marks: Mapping[Tile, Any],
+        marks: Mapping[Tile, object],
         kind: type[_Figures],
     ) -> list[RecordJob[_Figures]]:
         """Return jobs for tiles with their numbers of points, and with what affects each."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from ..base import las
 from ..base.distinct import DistinctPoints
@@ -21,6 +21,7 @@ from ..base.messages import Message, Report, without_repeated
 from ..classifier.model import Model
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
+from ..classifier.training_options import TrainingOptions
 from ..pipeline import pdal as pdal_env
 from ..pipeline.expansion import stage_files
 from ..pipeline.json_source import Override, overridden
@@ -78,7 +79,7 @@ class TrainTask:
     model: str  #: the file to write
     overrides: Sequence[Override] = ()
     #: of ``writers.classifiermodel``
-    stage_options: Mapping[str, Any] = field(default_factory=dict)
+    stage_options: Mapping[str, object] = field(default_factory=dict)
     #: the files of each survey, whose points are not neighbors of each other's
     surveys: Mapping[str, Sequence[str]] = field(default_factory=dict)
     named: Sequence[str] = ()  #: what the files were named by: patterns, tile indexes
@@ -155,7 +156,7 @@ class TrainTask:
 
     def _train(self, heights: Sequence[StageJson], report: Report) -> Model:
         """Train on all points of a survey at once, one survey after the other."""
-        training: Any = None
+        training: TrainingOptions | None = None
         distinct = DistinctPoints()
 
         def clouds() -> Iterator[TrainingCloud]:
