@@ -16,9 +16,8 @@ from ..base.options import Settings, setting
 from .cells import Kind, WireCubes, point_keys
 
 
-def _number(limits: tuple[float, float, float, str], help: str) -> Any:
-    """Return a number's setting from its default, lowest and highest value and unit."""
-    default, low, high, unit = limits
+def _number(default: float, low: float, high: float, unit: str, help: str) -> Any:
+    """Return the setting of a number."""
     return setting(default, "number", help, low, high, unit=unit)
 
 
@@ -30,21 +29,24 @@ class ObjectSettings(Settings):
     """
 
     cell: float = _number(
-        (0.5, 0.05, 100, "m"),
+        0.5,
+        0.05,
+        100,
+        "m",
         "Side of the grid's cells, about 1.4 times the spacing of points (1 for 2 points/m2), so "
         "that few cells of a roof are empty; where points are few the command objects enlarges "
         "the default, up to 4",
     )
     building_height: float = _number(
-        (1.5, 0, 100, "m"), "Minimum height of a building's cells above the ground"
+        1.5, 0, 100, "m", "Minimum height of a building's cells above the ground"
     )
     building_area: float = _number(
-        (4.0, 0, 10_000, "m2"), "Minimum area of a building or deck; smaller ones are left out"
+        4.0, 0, 10_000, "m2", "Minimum area of a building or deck; smaller ones are left out"
     )
-    tree_height: float = _number((3.0, 0, 100, "m"), "Minimum height of a tree")
-    tree_area: float = _number((1.0, 0, 1000, "m2"), "Minimum area of a tree's crown")
+    tree_height: float = _number(3.0, 0, 100, "m", "Minimum height of a tree")
+    tree_area: float = _number(1.0, 0, 1000, "m2", "Minimum area of a tree's crown")
     saddle: float = _number(
-        (0.3, 0, 10, "m"), "Depth of the saddle in the canopy that separates two trees"
+        0.3, 0, 10, "m", "Depth of the saddle in the canopy that separates two trees"
     )
 
 

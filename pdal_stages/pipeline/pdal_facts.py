@@ -32,6 +32,7 @@ from ..base.las_points import (
     size_of_entry,
 )
 from ..base.units import Units
+from ..stages.points import CodeLimit
 from ..stages.registry import stage_types
 from . import pdal as pdal_env
 from .inputs_outputs import is_writer, readers_files, writes_las
@@ -245,8 +246,8 @@ def check_class_codes(
                 )
 
 
-def _code_limit(writer: StageJson, before: list[StageJson], copied: bool) -> tuple[str, str] | None:
-    """Return the message for codes above 31, and the cure; None where all codes fit."""
+def _code_limit(writer: StageJson, before: list[StageJson], copied: bool) -> CodeLimit | None:
+    """Return why codes above 31 do not fit; None where all do."""
     if writer["type"] == "writers.copc":
         return None
     minor, format_id = las_version(writer, before)
@@ -255,11 +256,11 @@ def _code_limit(writer: StageJson, before: list[StageJson], copied: bool) -> tup
             f"class codes above {LEGACY_LIMIT} do not fit the LAS file that writers.las would "
             f"write (LAS 1.{minor}, dataformat_id {format_id})"
         )
-        return what, f"Give writers.las {_AS_LAS_14}"
+        return CodeLimit(what, f"Give writers.las {_AS_LAS_14}")
     if copied or not _compresses(writer) or pdal_env.compresses_las_14():
         return None
     what = f"this PDAL cannot compress LAS 1.4 with class codes above {LEGACY_LIMIT}"
-    return what, "Name the output .las, use PDAL 2.3, or run pdal-stages classify"
+    return CodeLimit(what, "Name the output .las, use PDAL 2.3, or run pdal-stages classify")
 
 
 def _compresses(writer: StageJson) -> bool:

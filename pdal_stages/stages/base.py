@@ -23,7 +23,7 @@ from ..base.options import Option, decode_options, option, option_of, parse_opti
 from ..base.units import named_unit
 from ..classifier.interface import ModelObserver
 from .options import Selection, ignore_option
-from .points import Points
+from .points import CodeLimit, Points
 from .where_expression import Expression
 
 _Placed = TypeVar("_Placed", bound="Stage")
@@ -85,9 +85,8 @@ class StageContext:
     #: Whether an earlier stage of the pipeline created a dimension that this one creates too: the
     #: values that points have are results then, not an input's leftovers.
     created_before: bool = False
-    #: What to report where a class code above 31 does not fit the pipeline's writer, and the cure;
-    #: None where all fit.
-    code_limit: tuple[str, str] | None = None
+    #: Why class codes above 31 do not fit the pipeline's writer; None where all fit.
+    code_limit: CodeLimit | None = None
     #: In a tile: the dimension that holds how many meters a point lies outside the tile; negative
     #: inside. Else empty.
     outside: str = ""

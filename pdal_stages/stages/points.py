@@ -6,7 +6,7 @@ from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,13 @@ def no_point_matches(where: str) -> Message:
     return Message(f"'where' matches no points: {shorten(where)}", Topic.NOTHING_MATCHES)
 
 
+class CodeLimit(NamedTuple):
+    """Why class codes above :data:`..base.asprs.LEGACY_LIMIT` do not fit."""
+
+    problem: str
+    cure: str
+
+
 @dataclass(eq=False)
 class Points:
     """One view of points, as a stage sees it."""
@@ -72,7 +79,7 @@ class Points:
     meters_outside: NDArray | None = None
     #: In tiles: the points whose results are used.
     used: NDArray[np.bool_] | None = None
-    code_limit: tuple[str, str] | None = None  #: as in :class:`.base.StageContext`
+    code_limit: CodeLimit | None = None  #: as in :class:`.base.StageContext`
 
     def __post_init__(self) -> None:
         """Evaluate `where`."""
@@ -305,14 +312,14 @@ class Points:
         if self.legacy_flags:
             flags = np.asarray(self.arrays["Classification"], np.uint8) & ~np.uint8(LEGACY_LIMIT)
             if flags.any():
-                limit = limit or (
+                limit = limit or CodeLimit(
                     f"class codes above {LEGACY_LIMIT} do not fit: the points were read from LAS "
                     "1.0-1.3, and some have the synthetic, key-point or withheld flag in the byte "
                     "of the class",
                     "Convert the input to LAS 1.4 first (minor_version 4, dataformat_id 6)",
                 )
         if limit and (largest := codes.max(initial=0)) > LEGACY_LIMIT:
-            raise OptionError(limit[0], found=f"code {largest}", cure=limit[1])
+            raise OptionError(limit.problem, found=f"code {largest}", cure=limit.cure)
         return codes | flags
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -331,9 +332,17 @@ def planes_of_blocks(
     for level in range(levels, 0, -1):
         sums = moments.pop()
         coarser, planes = planes, planes if level == levels else np.empty((*sums.shape[:2], 3))
-        parents = None if level == levels else (coarser, *spans[level + 1])
+        parents = None if level == levels else _Parents(coarser, *spans[level + 1])
         _fit_level(sums, 2.0**level, wanted[level], spans[level], parents, planes, threads)
     return planes, spans[1]
+
+
+class _Parents(NamedTuple):
+    """Planes of the next coarser level."""
+
+    planes: NDArray[np.float64]  #: (h, w, 3)
+    left: int  #: the first column ...
+    bottom: int  #: ... and row
 
 
 def _fit_level(
@@ -341,14 +350,13 @@ def _fit_level(
     size: float,
     needed: NDArray[np.bool_],
     corner: tuple[int, int],
-    parents: tuple[NDArray[np.float64], int, int] | None,
+    parents: _Parents | None,
     planes: NDArray[np.float64],
     threads: int | None,
 ) -> None:
     """Compute the needed planes of the blocks of one level, from those of the next coarser one.
 
-    A thread takes some rows. `parents` are the coarser planes, and their first column and row; None
-    where the planes have been evaluated.
+    A thread takes some rows. There are no `parents` where the planes have been evaluated.
     """
 
     def fit(first: int) -> None:
