@@ -335,6 +335,7 @@ def test_bad_input(survey, tmp_path):
     damaged = tmp_path / "f.las"
     damaged.write_bytes(Path(here).read_bytes()[:-5000])
     refused("cannot be read|cut short|shorter", [str(damaged)])
+    refused(f"1 of the inputs cannot be read .found {damaged}: the LAS", [here, str(damaged)])
     with pytest.raises(StageError, match="folder of the rasters cannot be created"):
         write_surfaces([here], here, progress=False)
     out.mkdir(exist_ok=True)

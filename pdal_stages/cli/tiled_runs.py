@@ -164,7 +164,7 @@ def print_run(run: TiledRun) -> None:
     s = run.summary
     parts = []
     if run.outputs:
-        files = Counter(output.state for output in run.outputs)
+        files = Counter[str](output.state for output in run.outputs)
         parts.append(f"{count_of(files['done'], 'file')} written{_other_states(files)}")
     parts.append(f"{count_of(s['states']['done'], 'tile')} done{_other_states(s['states'])}")
     speed = f"{s['points_per_second']:,.0f} points/s"

@@ -126,8 +126,12 @@ class InputSource:
     reader: StageJson  #: the stage that reads it, without the file's name
     extent: Extent | None = None  #: None where the header cannot be read
     stamp: Sequence[int] = ()  #: size and time at the start of the run
-    fault: str = ""  #: why it cannot be read
+    fault: str = ""  #: why it cannot be read, without its path
     index: CloudIndex | None = None  #: once it was read
+
+    def blame(self, reason: object) -> None:
+        """Keep why it cannot be read."""
+        self.fault = str(reason).removeprefix(f"{self.path}: ")
 
     @property
     def layout(self) -> Layout:
@@ -256,7 +260,7 @@ class Survey:
                     raise StageError("the name of the file is not UTF-8", cure="Rename the file")
                 odd += filter(None, [las_check.check_readable(source.path)])
             except StageError as error:
-                source.fault = str(error)
+                source.blame(error)
         self.messages += map(Message, copies_among(self.sources))
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
         self.messages += [Message(f"{text}{more}", Topic.INPUT) for text in odd[:1]]
@@ -279,7 +283,7 @@ class Survey:
                     reader = {**source.reader, "filename": source.path}
                     known[kind] = reference_of(reader, plan.unit)
             except PipelineError as error:
-                source.fault = str(error)
+                source.blame(error)
                 continue
             except StageError:
                 if plan.one_reference:
@@ -287,7 +291,7 @@ class Survey:
                 known[kind] = Reference(Units())  # no stage needs it
             references[source.path] = known[kind]
         if not references:
-            reasons = (source.fault for source in self.sources)
+            reasons = (f"{source.path}: {source.fault}" for source in self.sources)
             raise StageError("none of the inputs can be read", found=next(reasons, "no input"))
         if plan.one_reference:
             messages = check_one_reference(references)

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,10 @@ _CHANGED = (
 )
 
 
+#: ``ready`` are outputs whose tiles are done, ``kept`` are results of an earlier run.
+JobState = Literal["waiting", "ready", "done", "kept", "failed"]
+
+
 @dataclass
 class Job:
     """A task of a run and its state; subclasses tell what the task is about."""
@@ -59,9 +63,7 @@ class Job:
     outputs: list[str] | None = field(default=None, kw_only=True)
     needs: list[Job] = field(default_factory=list, kw_only=True)  #: jobs before: tiles of an output
     digest: str = field(default="", kw_only=True)  #: of everything that affects its result
-    #: ``waiting``, ``ready`` (an output whose tiles are done), ``done``, ``kept`` (from an earlier
-    #: run) or ``failed``.
-    state: str = field(default="waiting", kw_only=True)
+    state: JobState = field(default="waiting", kw_only=True)
     record: JobRecord | None = field(default=None, kw_only=True)  #: once it is done
     record_type: type[JobRecord] = field(default=FilesRecord, kw_only=True)
     cost: Cost | None = field(default=None, kw_only=True)  #: of its task
@@ -74,9 +76,9 @@ class Job:
         """Mark it as failed."""
         self.state, self.reason, self.blocked = "failed", reason, blocked
 
-    def fail_with(self, needed: Iterable[Job]) -> None:
+    def fail_with_needed(self) -> None:
         """Mark it as failed where any job that it needs has failed."""
-        if reason := next((job.reason for job in needed if job.reason), ""):
+        if reason := next((job.reason for job in self.needs if job.reason), ""):
             self.fail(reason)
 
     def keep(self, saved: JsonObject) -> None:
@@ -169,7 +171,7 @@ class TiledRun:
         jobs: list[tuple[str, Job]] = [(f"tile {job.name}", job) for job in self.tiles]
         jobs += [(job.outputs[0], job) for job in self.outputs if job.outputs]
         return [
-            *((p, why.removeprefix(f"{p}: ") + _BLOCKS) for p, why in self.unreadable.items()),
+            *((path, why + _BLOCKS) for path, why in self.unreadable.items()),
             *((path, _CHANGED) for path in self.changed),
             *((what, job.reason) for what, job in jobs if job.reason and not job.blocked),
         ]

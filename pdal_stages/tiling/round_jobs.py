@@ -34,18 +34,18 @@ class RoundJobs:
             users = layers[0][0]
         for number, (squares, blocks) in enumerate(layers):
             for job in squares:
-                job.fail_with(job.needs)
+                job.fail_with_needed()
             label = f"round {number + 1}"
             task_of = partial(self.run.tile_task, number)
             for job in self.run.do(label, self.run.unkept(squares), task_of):
                 self.run.messages_before.append(job.record.messages if job.record else [])
             for block in blocks:
-                block.fail_with(block.needs)
+                block.fail_with_needed()
             for _ in self.run.do(f"{label}, blocks", self.run.unkept(blocks), self._block_task):
                 pass
             self.run.squares += squares
         for job in waiting:
-            job.fail_with(job.needs)
+            job.fail_with_needed()
         stop_if_hopeless([job.reason for job in waiting])
 
     @cached_property

@@ -108,7 +108,7 @@ class SurveyRun:
         for job in self.do("reading the inputs", waiting, task_of):
             if job.failure is WriteError:  # the input is not the cause
                 raise StageError(job.reason)
-            job.source.fault = job.reason
+            job.source.blame(job.reason)
             job.source.index = job.record or job.source.index
             if job.record is not None and job.record.count:
                 odd = las_check.beyond_box(job.source.path, job.record.box)
