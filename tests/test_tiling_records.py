@@ -107,7 +107,7 @@ def test_damaged_records_are_none(tmp_path, text):
             assert job.state == "kept" and job.record is None and job.to_dict() == {"state": "kept"}
 
 
-def told(tiles, before=(), inputs=()):
+def shown_messages(tiles, before=(), inputs=()):
     """Return the messages of a run whose tiles and earlier rounds have some."""
     jobs = [
         TileJob(
@@ -122,13 +122,13 @@ def told(tiles, before=(), inputs=()):
 
 def test_messages_of_tiles_come_once_frequent_ones_first():
     rare, often = Message("rare", place="filters.a"), Message("often", place="filters.a")
-    assert told([[rare, often], [often]]) == [
+    assert shown_messages([[rare, often], [often]]) == [
         "filters.a: often (2 tiles)",
         "filters.a: rare (1 tile)",
     ]
     several = Message("often")
-    assert told([[often], [several]]) == ["often (1 tile)"]
-    assert told([[often]], inputs=[Message("odd", Topic.INPUT)]) == [
+    assert shown_messages([[often], [several]]) == ["often (1 tile)"]
+    assert shown_messages([[often]], inputs=[Message("odd", Topic.INPUT)]) == [
         "odd",
         "filters.a: often (1 tile)",
     ]
@@ -136,12 +136,14 @@ def test_messages_of_tiles_come_once_frequent_ones_first():
 
 def test_that_nothing_matches_is_told_where_it_holds_for_all_tiles():
     nothing = Message("no points", Topic.NOTHING_MATCHES)
-    assert told([[nothing], []]) == [] and told([[nothing], [nothing]]) == ["no points (2 tiles)"]
-    assert told([[], []], before=[[nothing]]) == ["no points (1 tile)"]
+    assert shown_messages([[nothing], []]) == [] and shown_messages([[nothing], [nothing]]) == [
+        "no points (2 tiles)"
+    ]
+    assert shown_messages([[], []], before=[[nothing]]) == ["no points (1 tile)"]
 
 
 def test_what_the_inputs_tell_better_is_left_out():
     assumed = Message("meters", Topic.METERS_ASSUMED, "filters.a")
-    assert told([[assumed]]) == ["filters.a: meters (1 tile)"]
+    assert shown_messages([[assumed]]) == ["filters.a: meters (1 tile)"]
     one_has_none = Message("b.laz has none", Topic.NO_REFERENCE)
-    assert told([[assumed]], inputs=[one_has_none]) == ["b.laz has none"]
+    assert shown_messages([[assumed]], inputs=[one_has_none]) == ["b.laz has none"]

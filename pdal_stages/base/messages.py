@@ -67,7 +67,7 @@ class Message:
         return cls(text, Topic(topic), place)
 
 
-def without_repeated(messages: Iterable[Message]) -> list[Message]:
+def drop_repeated(messages: Iterable[Message]) -> list[Message]:
     """Return messages but those of a stage that are there without its name, too."""
     several = dict.fromkeys(messages)
     return [m for m in several if not m.place or replace(m, place="") not in several]

@@ -18,7 +18,7 @@ from ..base.las import named_copc, number_type, pdal_type
 from ..base.las_copy import LasCopy
 from ..base.las_points import PART, Layout, describe, read_records
 from ..base.messages import Message
-from ..stages.points import SELECTED, no_point_matches
+from ..stages.points import SELECTED, warning_of_no_match
 from ..stages.registry import stage_types
 from ..stages.where_expression import Expression
 from . import pdal as pdal_env
@@ -103,7 +103,7 @@ def describe_selection(where: str | None, known: Mapping[str, NDArray]) -> list[
     """Return a message where a condition selects no point."""
     chosen = known.get(SELECTED)
     nothing = chosen is not None and len(chosen) and not chosen.any()
-    return [no_point_matches(str(where))] if nothing else []
+    return [warning_of_no_match(str(where))] if nothing else []
 
 
 def copy_of(

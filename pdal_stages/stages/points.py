@@ -48,7 +48,7 @@ _FLAGS = ("Synthetic", "KeyPoint", "Withheld", "Overlap")
 _SHARE_ROUNDING = 1e-5
 
 
-def no_point_matches(where: str) -> Message:
+def warning_of_no_match(where: str) -> Message:
     """Return the warning that a condition holds for no point."""
     return Message(f"'where' matches no points: {shorten(where)}", Topic.NOTHING_MATCHES)
 
@@ -95,7 +95,7 @@ class Points:
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
             # Where `classify` marked no point, the stage that marks them has said so.
             if self.count and not self.report.figures["where"] and SELECTED not in self.where.text:
-                self.report.warnings.append(no_point_matches(self.where.text))
+                self.report.warnings.append(warning_of_no_match(self.where.text))
 
     @property
     def inside(self) -> NDArray[np.bool_]:

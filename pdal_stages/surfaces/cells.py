@@ -18,7 +18,7 @@ from ..base.asprs import NOISE, TERRAIN, WIRES_AND_TOWERS
 from ..base.grid import GridWindow, begins_run, cell_numbers
 from ..tiling.inputs import LonePoints
 from ..tiling.options import LARGEST_TILE, TILE_POINT, Density, TileGrid
-from ..tiling.tile_records import Part, Reduced
+from ..tiling.tile_records import Part, ReducedTile
 from .triangulation import NEAR, SPLIT
 
 Integers = NDArray[np.int64]
@@ -113,7 +113,7 @@ def usable(part: Mapping[str, NDArray], lone: LonePoints) -> NDArray[np.bool_]:
 
 
 @dataclass
-class TileFigures(Reduced):
+class TileFigures(ReducedTile):
     """Figures of a tile that was reduced to cells."""
 
     window: Sequence[int]  #: of the cells with points, as :class:`GridWindow` has it

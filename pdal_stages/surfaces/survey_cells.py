@@ -18,7 +18,7 @@ from ..base.json_types import JsonObject
 from ..tiling.inputs import LonePoints
 from ..tiling.jobs import load_arrays, save_arrays
 from ..tiling.records import JobRecord
-from ..tiling.tile_records import Part, Reduced
+from ..tiling.tile_records import Part, ReducedTile
 from .cells import HIGHEST, STEPS, CellRule, Integers, cells_at, steps, usable
 
 #: Of points without times: a first time that is later than all.
@@ -92,7 +92,7 @@ def _is_last(part: Mapping[str, NDArray]) -> NDArray[np.bool_]:
 
 
 @dataclass
-class ReportFigures(Reduced):
+class ReportFigures(ReducedTile):
     """Figures of a tile that was reduced for the report."""
 
     files: Mapping[str, JsonObject]  #: see :func:`describe`, by path

@@ -11,7 +11,7 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import KW_ONLY, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,7 +23,7 @@ from ..base.columns import LazyColumns
 from ..base.errors import StageError
 from ..base.files import make_own_folder, try_lock, whole_files
 from ..base.json_types import JsonObject
-from ..base.messages import Message, Topic, count_of, without_repeated
+from ..base.messages import Message, Topic, count_of, drop_repeated
 from ..base.version import __version__
 from ..pipeline.workers import Cost
 from .inputs import CloudIndex, InputSource
@@ -59,18 +59,18 @@ class Job:
 
     name: str  #: its key in the work folder
     points: int = 0  #: its own; 0 where unknown before it is read
+    _: KW_ONLY
     #: files of the writers; None where its results go into outputs of other jobs
-    outputs: list[str] | None = field(default=None, kw_only=True)
-    needs: list[Job] = field(default_factory=list, kw_only=True)  #: jobs before: tiles of an output
-    digest: str = field(default="", kw_only=True)  #: of everything that affects its result
-    state: JobState = field(default="waiting", kw_only=True)
-    record: JobRecord | None = field(default=None, kw_only=True)  #: once it is done
-    record_type: type[JobRecord] = field(default=FilesRecord, kw_only=True)
-    cost: Cost | None = field(default=None, kw_only=True)  #: of its task
-    reason: str = field(default="", kw_only=True)  #: why it failed
-    #: the error of its task; None where it failed without
-    failure: type[Exception] | None = field(default=None, kw_only=True)
-    blocked: bool = field(default=False, kw_only=True)  #: an unreadable input is the reason
+    outputs: list[str] | None = None
+    needs: list[Job] = field(default_factory=list)  #: jobs before: tiles of an output
+    digest: str = ""  #: of everything that affects its result
+    state: JobState = "waiting"
+    record: JobRecord | None = None  #: once it is done
+    record_type: type[JobRecord] = FilesRecord
+    cost: Cost | None = None  #: of its task
+    reason: str = ""  #: why it failed
+    failure: type[Exception] | None = None  #: the error of its task
+    blocked: bool = False  #: an unreadable input is the reason
 
     def fail(self, reason: str, blocked: bool = False) -> None:
         """Mark it as failed."""
@@ -105,9 +105,10 @@ class Job:
 class InputJob(Job):
     """Read an input and sort its points."""
 
-    source: InputSource = field(kw_only=True)
-    record: CloudIndex | None = field(default=None, kw_only=True)
-    record_type: type[CloudIndex] = field(default=CloudIndex, kw_only=True)
+    _: KW_ONLY
+    source: InputSource
+    record: CloudIndex | None = None
+    record_type: type[CloudIndex] = CloudIndex
 
 
 @dataclass
@@ -115,8 +116,9 @@ class TileJob(Job):
     """Run a round on a tile, or on a square of tiles."""
 
     tile: tuple[int, int] = (0, 0)  #: column and row
-    record: TileRecord | None = field(default=None, kw_only=True)
-    record_type: type[TileRecord] = field(default=TileRecord, kw_only=True)
+    _: KW_ONLY
+    record: TileRecord | None = None
+    record_type: type[TileRecord] = TileRecord
 
     @property
     def is_short(self) -> bool:
@@ -135,9 +137,10 @@ class BlockJob(Job):
 class OutputJob(Job):
     """Assemble an output from tiles."""
 
-    source: InputSource = field(kw_only=True)  #: the input that it is of
-    record: OutputRecord | None = field(default=None, kw_only=True)
-    record_type: type[OutputRecord] = field(default=OutputRecord, kw_only=True)
+    _: KW_ONLY
+    source: InputSource  #: the input that it is of
+    record: OutputRecord | None = None
+    record_type: type[OutputRecord] = OutputRecord
 
 
 #: A job that may write outputs.
@@ -201,7 +204,7 @@ def _records_of(jobs: Iterable[TileJob]) -> list[TileRecord]:
     return [job.record for job in jobs if job.record is not None]
 
 
-def _done(tiles: Iterable[TileJob]) -> list[TileJob]:
+def _finished_tiles(tiles: Iterable[TileJob]) -> list[TileJob]:
     """Return the tiles that this run has done."""
     return [job for job in tiles if job.state == "done"]
 
@@ -210,7 +213,7 @@ def summarize(
     tiles: list[TileJob], squares: list[TileJob], cpu_seconds: float, seconds: float
 ) -> JsonObject:
     """Return the figures of all tiles and squares of rounds, for :attr:`TiledRun.summary`."""
-    worked = _records_of(_done(tiles))
+    worked = _records_of(_finished_tiles(tiles))
     classes: Counter[str] = Counter()
     point_counts: Counter[str] = Counter()
     for record in _records_of(tiles):
@@ -242,7 +245,7 @@ def messages_of(
 
     These come once each, frequent ones first.
     """
-    done = _records_of(_done(tiles))
+    done = _records_of(_finished_tiles(tiles))
     counts: Counter[Message] = Counter()
     for lines in ([record.messages for record in done if record.points], before):
         for message, n in Counter(each for line in lines for each in dict.fromkeys(line)).items():
@@ -250,7 +253,7 @@ def messages_of(
                 counts[message] += n
             elif n == len(lines):
                 counts[message] = max(counts[message], n)
-    shown = Counter({message: counts[message] for message in without_repeated(counts)})
+    shown = Counter({message: counts[message] for message in drop_repeated(counts)})
     if any(each.topic is Topic.NO_REFERENCE for each in inputs):  # it tells what is assumed
         for message in [each for each in shown if each.topic is Topic.METERS_ASSUMED]:
             del shown[message]
@@ -258,7 +261,7 @@ def messages_of(
     messages += [f"{m} ({count_of(n, 'tile')})" for m, n in shown.most_common(_MOST_MESSAGES)]
     if len(shown) > _MOST_MESSAGES:
         messages.append(f"and {len(shown) - _MOST_MESSAGES} more; see --report")
-    if short := [job.name for job in [*_done(tiles), *squares] if job.is_short]:
+    if short := [job.name for job in [*_finished_tiles(tiles), *squares] if job.is_short]:
         messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
             "or terrain reach farther "
@@ -373,7 +376,7 @@ class Store:
         """Return the record of a job if `digest` matches and the files it wrote are unchanged."""
         record = self.note(name)
         with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
-            unchanged = all(file.is_as_written for file in written_files(record))
+            unchanged = all(file.is_unchanged for file in written_files(record))
             if record.get("fingerprint") == digest and unchanged:
                 return record
         return None
@@ -384,7 +387,7 @@ class Store:
         with contextlib.suppress(TypeError):
             for file in written_files(self.note(name)):
                 with contextlib.suppress(OSError, ValueError, TypeError):
-                    if file.digest and not file.is_as_written:
+                    if file.digest and not file.is_unchanged:
                         paths.append(str(file.path))
         return paths
 

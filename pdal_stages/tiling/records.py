@@ -25,7 +25,7 @@ class WrittenFile(NamedTuple):
     digest: str  #: empty for the run's own arrays, which nobody edits
 
     @property
-    def is_as_written(self) -> bool:
+    def is_unchanged(self) -> bool:
         """Return whether it holds what was written; OSError where it is gone.
 
         It is read only where its size or time differ, as after it was copied.

@@ -41,7 +41,7 @@ from ..pipeline.pdal_facts import check_class_codes
 from ..pipeline.run import Pipeline
 from ..pipeline.runtime import Callbacks, ExpandedStage, points_of
 from ..stages.base import WHOLE_CLOUD
-from ..stages.points import RESERVED, SELECTED, class_counts, no_point_matches
+from ..stages.points import RESERVED, SELECTED, class_counts, warning_of_no_match
 from ..stages.registry import stage_types
 from .earlier_rounds import (
     ChangedValues,
@@ -114,7 +114,7 @@ class _RoundRun:
                 self.needs_m += [distance_m + r.reach for r in stage.reports if r.beyond_halo]
         messages = _messages(pipeline)
         if plan.where and len(origins) and not any(each[SELECTED].any() for each in origins):
-            messages.append(no_point_matches(plan.where))
+            messages.append(warning_of_no_match(plan.where))
         return RoundResult(
             _collect(self.views, self.pieces),
             max(self.needs_m),

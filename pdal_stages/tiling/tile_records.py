@@ -11,7 +11,7 @@ import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
@@ -54,10 +54,11 @@ class LonePoint(NamedTuple):
 
 
 @dataclass
-class Reduced(JobRecord):
+class ReducedTile(JobRecord):
     """Figures of a tile that was reduced; subclasses add theirs."""
 
-    lone: list[LonePoint] = field(default_factory=list, kw_only=True)
+    _: KW_ONLY
+    lone: list[LonePoint] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Take points as JSON holds them, too."""
@@ -65,10 +66,10 @@ class Reduced(JobRecord):
 
 
 _Figures = TypeVar("_Figures", bound=JobRecord)
-_Reduced = TypeVar("_Reduced", bound=Reduced)
+_ReducedTile = TypeVar("_ReducedTile", bound=ReducedTile)
 #: Reduces the points of a tile, those of each input that has any there, to arrays and figures. Lone
 #: points are to be left out of the arrays.
-Reduce = Callable[[list[Part], LonePoints], tuple[dict[str, NDArray], _Reduced]]
+Reduce = Callable[[list[Part], LonePoints], tuple[dict[str, NDArray], _ReducedTile]]
 #: Returns the task that computes the result of a tile from the arrays of those around it, by tile,
 #: writes it to a file, and returns figures.
 Compute = Callable[[Tile, dict[Tile, str], str], Callable[[], _Figures]]
@@ -78,8 +79,9 @@ Compute = Callable[[Tile, dict[Tile, str], str], Callable[[], _Figures]]
 class RecordJob(Job, Generic[_Figures]):
     """Reduce a tile, or compute a result of it, with figures."""
 
-    tile: Tile = field(kw_only=True)
-    record: _Figures | None = field(default=None, kw_only=True)
+    _: KW_ONLY
+    tile: Tile
+    record: _Figures | None = None
 
     @property
     def figures(self) -> _Figures:
@@ -134,8 +136,12 @@ class RecordRun(SurveyRun):
     """A run that reduces the tiles of a survey, and computes results from the records."""
 
     def reduce(
-        self, name: str, settings: JsonObject, reduce: Reduce[_Reduced], kind: type[_Reduced]
-    ) -> list[RecordJob[_Reduced]]:
+        self,
+        name: str,
+        settings: JsonObject,
+        reduce: Reduce[_ReducedTile],
+        kind: type[_ReducedTile],
+    ) -> list[RecordJob[_ReducedTile]]:
         """Reduce the points of each tile; return its jobs with the figures, which are of a kind.
 
         The arrays lie in :meth:`path_of` the job. `settings` are all that affects them beside the
@@ -155,7 +161,7 @@ class RecordRun(SurveyRun):
             seen = "; ".join(f"{path}: {why}" for path, why in [*faults.items()][:_MOST_REASONS])
             raise StageError(f"{len(faults)} of the inputs cannot be read", found=seen)
 
-        def task_of(job: RecordJob[_Reduced]) -> Callable[[], _Reduced]:
+        def task_of(job: RecordJob[_ReducedTile]) -> Callable[[], _ReducedTile]:
             sources = near[job.tile]
             return partial(_reduce_tile, grid, job.tile, sources, reduce, lone, self.path_of(job))
 
@@ -166,7 +172,7 @@ class RecordRun(SurveyRun):
     def compute(
         self,
         name: str,
-        reduced: Sequence[RecordJob[_Reduced]],
+        reduced: Sequence[RecordJob[_ReducedTile]],
         tiles: Iterable[Tile],
         reach: float,
         compute: Compute[_Figures],
@@ -179,7 +185,7 @@ class RecordRun(SurveyRun):
         """
         grid, of_tile = self.survey.grid, {job.tile: job for job in reduced}
         wide = range(-math.ceil(reach / grid.size), math.ceil(reach / grid.size) + 1)
-        near: dict[Tile, list[RecordJob[_Reduced]]] = {}
+        near: dict[Tile, list[RecordJob[_ReducedTile]]] = {}
         for i, j in tiles:
             sources = [
                 of_tile[i + k, j + l] for l in wide for k in wide if (i + k, j + l) in of_tile
@@ -284,10 +290,10 @@ def _reduce_tile(
     grid: TileGrid,
     tile: Tile,
     sources: Sequence[InputSource],
-    reduce: Reduce[_Reduced],
+    reduce: Reduce[_ReducedTile],
     lone: LonePoints,
     target: str,
-) -> _Reduced:
+) -> _ReducedTile:
     """Read the points of a tile, save the arrays they are reduced to, and return the figures."""
     parts = points_of_tile(grid, tile, sources)
     arrays, figures = reduce(parts, lone)

@@ -17,7 +17,7 @@ from ..base.files import check_outputs
 from ..base.json_types import StageJson
 from ..base.las_points import columns_of_files
 from ..base.memory import free_memory
-from ..base.messages import Message, Report, without_repeated
+from ..base.messages import Message, Report, drop_repeated
 from ..classifier.model import Model
 from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
@@ -133,7 +133,7 @@ class TrainTask:
         stage.finish(model, report)
         messages = [Message(warning)] if warning else []
         # A message that the preparation has as well comes once.
-        return without_repeated([*messages, *report.messages])
+        return drop_repeated([*messages, *report.messages])
 
     def _read(self, files: Sequence[str], heights: Sequence[StageJson]) -> Points:
         """Read the points with heights."""
