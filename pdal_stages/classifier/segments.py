@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from ..base.grid import begins_run, cell_keys, cell_numbers, key_offset, places_among, split_keys
 from ..base.jit import njit
+from ..base.key_order import order_by_key
 from ..features.cell_means import WHOLE
 from ..terrain.components import number_sets
 
@@ -159,7 +160,7 @@ def _count_votes(
     numbers = [cell_numbers(xyz[:, axis], RULES.cell) for axis in (0, 1)]
     # Stray points farther away than keys can tell share cells at the end of the grid.
     keys = cell_keys(*(np.clip(axis, -_FARTHEST, _FARTHEST) for axis in numbers))
-    order = np.argsort(keys)
+    order = order_by_key(keys)
     start = np.flatnonzero(begins_run(keys[order]))
     cell = np.empty(len(keys), np.int64)
     cell[order] = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(keys))))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ..base.grid import begins_run, compact_keys
 from ..base.jit import njit
+from ..base.key_order import order_by_key
 
 #: A share of 1.
 WHOLE = 65535
@@ -36,7 +37,7 @@ def cell_means(
     alone, as a whole.
     """
     keys, offsets = compact_keys(coordinates, side)
-    order = np.argsort(keys)
+    order = order_by_key(keys)
     keys = keys[order]
     start = np.append(np.flatnonzero(begins_run(keys)), len(keys))
     occupied = keys[start[:-1]]

@@ -14,7 +14,11 @@ import numpy as np
 
 from ..base.errors import StageError
 from ..base.grid import begins_run, cell_numbers, compact_keys
+from ..base.key_order import order_by_key
 
+#: Bits of a place along x within a cell, by which points are sorted first: fine enough that few are
+#: equal, few enough that sorting is fast.
+FINE_BITS = 22
 #: Coordinates beyond this many meters are no point cloud (and would overflow cell numbers).
 LIMIT = 1e12
 #: Largest coordinate in float32, meters: from there on its steps are 8 mm and more, too coarse for
@@ -111,13 +115,13 @@ def _order(xyz: np.ndarray, key: np.ndarray, cell: float) -> np.ndarray:
 
     They are sorted by one number of cell and x first, of which few are equal.
     """
-    bits = min(62 - int(key.max(initial=0)).bit_length(), 30)
+    bits = min(62 - int(key.max(initial=0)).bit_length(), FINE_BITS)
     x = xyz[:, 0] * (1.0 / cell)
     fine = (key << bits) + np.floor((x - np.floor(x)) * 2.0**bits).astype(np.int64)
-    order = np.argsort(fine)
+    order = order_by_key(fine)
     fine = fine[order]
     begins = begins_run(fine)
     tied = np.flatnonzero(~(begins & np.append(begins[1:], True)))
     again = order[tied]
     order[tied] = again[np.lexsort((xyz[again, 2], xyz[again, 1], xyz[again, 0], fine[tied]))]
-    return order.astype(np.int32) if len(order) < 2**31 else order
+    return order

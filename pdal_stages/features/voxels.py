@@ -19,6 +19,7 @@ from ..base.errors import OptionError
 from ..base.grid import compact_keys
 from ..base.hashing import hash_rows
 from ..base.jit import njit
+from ..base.key_order import order_by_key
 
 #: Smallest side of a voxel, meters: finer than the steps of most coordinates, so that a voxel holds
 #: copies of one point alone.
@@ -119,10 +120,10 @@ def _one_each(
     """
     keys, _ = compact_keys(xyz, side)
     if usable is None:
-        order = np.argsort(keys)
+        order = order_by_key(keys)
     else:
         there = np.flatnonzero(usable)
-        order = there[np.argsort(keys[there])]
+        order = there[order_by_key(keys[there])]
     by = np.arange(len(xyz), dtype=np.int32 if len(xyz) < 2**31 else np.int64)
     single = choose_one_each(order, keys[order], hash_rows([*xyz.T, *values], 0), by)
     return None if single else by

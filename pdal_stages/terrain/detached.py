@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..base.grid import begins_run
 from ..base.jit import device, njit
+from ..base.key_order import order_by_key
 from ..base.threads import map_blocks
 from .components import root_of
 
@@ -217,7 +218,7 @@ def _sum_by_key(
     keys: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return each key once, ascending, and the sums of its counts."""
-    order = np.argsort(keys, kind="stable")
+    order = order_by_key(keys)
     keys = keys[order]
     starts = np.flatnonzero(begins_run(keys))
     return keys[starts], np.add.reduceat(counts[order], starts) if len(keys) else counts
