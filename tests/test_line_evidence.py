@@ -54,19 +54,20 @@ def lies_on_line(point, p_point, parts, p, guides, p_guides):
     p, p_guides = p[near(parts)].astype(float), p_guides[near(guides)].astype(float)
     parts, guides = parts[near(parts)] - point, guides[near(guides)] - point
     most = RULES.guides
+    width = RULES.width if p_point >= RULES.likely else RULES.unlikely_width
     for toward in guides[:: max(1, len(guides) ** 2 // RULES.looks)]:
         if np.hypot(*toward[:2]) < RULES.far:
             continue
         _, away = beside(guides, toward)
-        of_guides = (p_guides * np.maximum(0, 1 - (away / RULES.width) ** 2)).sum()
+        of_guides = (p_guides * np.maximum(0, 1 - (away / width) ** 2)).sum()
         if of_guides < most:
             continue
         most = of_guides
         along, away = beside(parts, toward)
-        tube, ring = away <= RULES.width, away <= RULES.ring
+        tube, ring = away <= width, away <= RULES.ring
         places = np.sort(along[tube])
         low, high = -end(-places[::-1], RULES.gap), end(places, RULES.gap)
-        worth = np.where(tube, 1 - (away / RULES.width) ** 2, -RULES.against * (1 - p_point) * ring)
+        worth = np.where(tube, 1 - (away / width) ** 2, -RULES.against * (1 - p_point) * ring)
         between = (along >= low) & (along <= high)
         if high - low >= RULES.length and (p * worth)[between].sum() >= RULES.evidence:
             return True

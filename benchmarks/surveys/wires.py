@@ -5,7 +5,7 @@
 
 MODELS are those of `leave_one_out.py --save`, FILE its figures. Strips of the labeled line,
 thinned, are classified by models that have neither the strip nor copies of its wires, and single
-strands over two surveys, and lines with towers set into all others, by models without their groups.
+strands over two surveys, and lines set into all others, by models without their groups.
 `--crops` adds helicopter scans of power lines, which no license lets anybody train on, by the
 shipped model. Towers are found as `filters.towers` finds them.
 """
@@ -159,7 +159,7 @@ def strands(data: Path, models: Path) -> list[dict[str, Any]]:
 
 
 def lines_set_in(data: Path, models: Path) -> list[dict[str, Any]]:
-    """Score wires and towers of lines that are set into surveys, high and medium voltage alike.
+    """Score wires and towers of lines that are set into surveys, of every voltage.
 
     `tower beside` are false points of towers that are wires.
     """

@@ -54,7 +54,8 @@ class LineEvidenceRules(NamedTuple):
     length: float = 10.0  #: least extent of a line
     gap: float = 16.0  #: largest gap in it: thin wires give few echoes
     radius: float = 32.0  #: candidates up to this far away, in plan, are looked at
-    width: float = 0.4  #: radius of the tube: a wire sags, and its echoes scatter by 0.1 m
+    width: float = 0.4  #: radius of a guide's tube: a wire sags, and its echoes scatter by 0.1 m
+    unlikely_width: float = 0.32  #: of other candidates' tubes: what is beside a wire is none
     ring: float = 1.2  #: outer radius of the ring around it
     #: what a candidate in the ring counts, times how unlikely the point on the line is
     against: float = 1.5
@@ -186,20 +187,21 @@ def _mark(points, probability, place, parts, guides, rules, out):
         every, m = near, 0
         most = rules.guides
         against = rules.against * (1.0 - probability[k])
+        width = rules.width if probability[k] >= rules.likely else rules.unlikely_width
         for toward in range(0, n, max(1, n * n // rules.looks)):
             away = np.sqrt(near[0, toward] ** 2 + near[1, toward] ** 2)
             if away < rules.far:
                 continue
             line = near[0, toward] / away, near[1, toward] / away, near[2, toward] / away
-            of_guides = _evidence_in_tube(near, n, line, rules.width)
+            of_guides = _evidence_in_tube(near, n, line, width)
             if of_guides < most:
                 continue
             most = of_guides
             if m == 0:
                 every, m = _near(points[k], place[k], parts, rules.radius)
-            if _evidence_in_tube(every, m, line, rules.width) < 0.99 * rules.evidence:
+            if _evidence_in_tube(every, m, line, width) < 0.99 * rules.evidence:
                 continue  # the whole tube is not enough: no need to look for gaps and at the ring
-            if _evidence_of_line(every, m, line, against, rules) >= rules.evidence:
+            if _evidence_of_line(every, m, line, width, against, rules) >= rules.evidence:
                 out[k] = True
                 break
 
@@ -233,7 +235,7 @@ def _evidence_in_tube(near, n, line, width):
 
 
 @device(_nrt=True)
-def _evidence_of_line(near, n, line, against, rules):
+def _evidence_of_line(near, n, line, width, against, rules):
     """Return what n parts count for a line through 0, along which gaps are small; 0 if short."""
     u, v, rise = line
     along, worth = np.empty(n), np.empty(n)
@@ -244,9 +246,9 @@ def _evidence_of_line(near, n, line, against, rules):
             continue
         place = near[0, k] * u + near[1, k] * v
         beside = aside * aside + (near[2, k] - place * rise) ** 2
-        if beside <= rules.width**2:
+        if beside <= width**2:
             along[inside] = place
-            worth[inside] = near[3, k] * (1.0 - beside / rules.width**2)
+            worth[inside] = near[3, k] * (1.0 - beside / width**2)
             inside += 1
         elif beside <= rules.ring**2:
             outside -= 1
