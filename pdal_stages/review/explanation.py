@@ -66,7 +66,6 @@ class GroundSteps:
     raised: float  #: how high given ground stands above that point
     near: int  #: points within 5 m in plan
     lower: int  #: of them those more than 1 m below the point
-    lower_share: float  #: share of these
     has_noise: bool  #: whether noise was left in
     height: float  #: above the ground
     above_provisional: float

@@ -1,17 +1,32 @@
 """Explanations as text: about a screen, for people who know lidar and not the code.
 
-The sentences are rows of words.json; here is their order, and the table of the model's inputs.
+The sentences are rows of :mod:`.words`; here is their order, and the table of the model's inputs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from ..base.asprs import class_name
 from ..base.messages import one_line
 from .explanation import TOWERS, Explanation, PassTrace, Verdict
 from .trace_points import SURROUNDINGS
-from .words import Record, fill, show_value, words_for
+from .words import (
+    AFTER,
+    DIFFERENCE,
+    GROUND,
+    HEAD,
+    MODEL,
+    NOISE,
+    Row,
+    fill,
+    show_value,
+    words_for,
+)
+
+_Record = TypeVar("_Record")
 
 #: Inputs that are shown of the last pass, beside its surroundings.
 _OF_LAST = 4
@@ -23,9 +38,9 @@ _NAME = 16
 _NUMBER = 12
 
 
-def _fill(table: str, record: Record, count: int | None = None) -> list[str]:
-    """Return the rows of a table that apply to a record, or the first `count` of them."""
-    return [_row(name, text) for name, text in fill(table, record, count)]
+def _fill(table: Sequence[Row[_Record]], record: _Record) -> list[str]:
+    """Return the rows of a table that apply to a record."""
+    return [_row(name, text) for name, text in fill(table, record)]
 
 
 def _row(name: str, text: str) -> str:
@@ -41,12 +56,12 @@ def lines(told: Explanation) -> list[str]:
     ground = [_row("ground", "found by another stage")]
     model = [_row("nothing", told.kept)]
     return [
-        *_fill("head", told),
+        *_fill(HEAD, told),
         *_differences(told),
         "",
         "WHAT BECOMES OF IT, COMPUTED NOW",
-        *(noise if told.noise is None else _fill("noise", told.noise, 1)),
-        *(ground if told.ground is None else _fill("ground", told.ground)),
+        *(noise if told.noise is None else _fill(NOISE, told.noise)[:1]),
+        *(ground if told.ground is None else _fill(GROUND, told.ground)),
         "",
         "WHAT THE MODEL SEES",
         *(model if told.verdict is None else _verdict(told.verdict, told.is_changed)),
@@ -65,14 +80,14 @@ def _differences(told: Explanation) -> list[str]:
         f"{name} is {before:.2f} in the file, {now:.2f} now"
         for name, (before, now, _) in told.compared.items()
     ]
-    out += [line for text in _fill("differs", told, 1) for line in text.split("\n")]
+    out += [line for text in _fill(DIFFERENCE, told)[:1] for line in text.split("\n")]
     return ["", "WHAT DIFFERS", *(f"  {line}" for line in out)]
 
 
 def _steps(told: Explanation) -> list[str]:
     """Return what each step after the model made of the class."""
     shown = [step for step in told.steps if not (step.is_same and step.name == TOWERS)]
-    rows = [row for step in shown for row in _fill("after", step, 1)]
+    rows = [row for step in shown for row in _fill(AFTER, step)[:1]]
     return rows or [_row("nothing", "none of them changes classes after the model")]
 
 
@@ -92,7 +107,7 @@ def _verdict(verdict: Verdict, is_changed: bool) -> list[str]:
     for name, share in {**shares, "in the end": verdict.probabilities}.items():
         numbers = (f"{share.get(code, 0.0):>{_NUMBER}.2f}" for code in verdict.classes)
         out.append(_row(name, "".join(numbers)))
-    out += _fill("model", verdict)
+    out += _fill(MODEL, verdict)
     if not verdict.has_reasons:
         return out
     if is_changed:

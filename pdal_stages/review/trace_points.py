@@ -150,8 +150,7 @@ def _ground(recording: Recording, place: int) -> GroundSteps | None:
 
     away = (units.horizontal * (cloud[axis] - cloud[axis][row]) for axis in "XY")
     near = np.hypot(*away) <= _NEAR_M
-    count = int(np.count_nonzero(near))
-    lower = int(np.count_nonzero(cloud["Z"][near] * units.vertical < z - _LOWER_M))
+    lower = cloud["Z"][near] * units.vertical < z - _LOWER_M
     lowest = elevation("low_outliers" if "low_outliers" in piece else "minimum_grid")
     floor, land = elevation("openings"), elevation("wide_roofs")
     lowest_near, given = elevation("low_outliers", round(_NEAR_M / cell)), elevation("given_ground")
@@ -174,9 +173,8 @@ def _ground(recording: Recording, place: int) -> GroundSteps | None:
         given=given,
         lowest_near=lowest_near,
         raised=0.0 if given is None else given - (lowest_near or 0.0),
-        near=count,
-        lower=lower,
-        lower_share=lower / count,
+        near=len(lower),
+        lower=int(np.count_nonzero(lower)),
         has_noise=not len(recording.noise),
         height=heights["HeightAboveGround"],
         above_provisional=heights[JUDGED[0]],
