@@ -171,19 +171,29 @@ def test_only_models_with_lines_have_parts(models, tmp_path):
 @pytest.mark.pdal
 @pytest.mark.parametrize("pdal", [[], [{"type": "filters.assign", "value": "UserData = 3"}]])
 def test_in_tiles_as_in_one_piece_with_and_without_stages_of_pdal(tmp_path, pdal):
+    """Both parts run in one pipeline of PDAL, too, and count in a report that is made anew."""
     results = {"margin": True, "probabilities": True, "compact": True}
     job = [
         write(tmp_path / "in.las", *lattice()),
         {"type": "filters.hag_morphological", "ground": True, "openings": "5,17"},
-        {"type": "filters.modelclassifier", "model": "standard", **results, "keep_sure": 0.9},
+        {"type": "filters.modelclassifier", "model": "standard", **results, "tag": "model"},
         *pdal,
         {"type": "filters.towers"},
         {"type": "writers.las", "extra_dims": "all"},
     ]
-    for name, words in (("whole", ()), ("tiled", ("--tile", "30", "--workers", "0"))):
+    job[2] |= {"keep_sure": 0.9, "where": "Classification != 6"}
+    tiles = ("--tile", "30", "--workers", "0", "--report", str(tmp_path / "report.json"))
+    reports = []
+    for name, words in (("whole", ()), ("tiled", tiles), ("tiled", (*tiles, "--resume"))):
         job[-1]["filename"] = str(tmp_path / f"{name}.las")
         (tmp_path / "job.json").write_text(json.dumps(job))
         assert main(["pipeline", str(tmp_path / "job.json"), "--no-progress", *words]) == 0
+        if words:
+            reports.append(json.loads((tmp_path / "report.json").read_text()))
+    assert [report["models"] for report in reports] == [["standard"]] * 2
+    assert [report["states"]["done"] > 0 for report in reports] == [True, False]
+    assert reports[0]["point_counts"] == reports[1]["point_counts"]
+    assert reports[0]["point_counts"]["filters.modelclassifier.outside_where"] > 0
     whole, tiled = (laspy.read(tmp_path / f"{name}.las") for name in ("whole", "tiled"))
     assert (np.asarray(whole.classification) == 14).sum() > 500
     names = sorted(whole.point_format.dimension_names)

@@ -202,6 +202,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
     @property
     def hint(self) -> str | None:
         """Return where the dimensions of the model come from, if its file tells."""
+        if self.part == LINES:
+            return "Leave out the option 'part', which is for tiles"
         if self.preparation:
             return f"Put before this stage: {as_json(self.preparation)}"
         by_hand = ", ".join(self.model.info.get("by_hand", ()))

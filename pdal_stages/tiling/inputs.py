@@ -395,9 +395,10 @@ class Survey:
 
     def figures(self, plan: TilePlan) -> JsonObject:
         """Return what the report tells about the pipeline, its models, the inputs and the tiles."""
+        models = dict.fromkeys(str(stage["model"]) for stage in plan.in_tiles if "model" in stage)
         return {
             "pipeline": plan.name,
-            "models": [str(stage["model"]) for stage in plan.in_tiles if "model" in stage],
+            "models": list(models),
             "started": self.started,
             "tile": self.grid.size,
             "halo_m": plan.halo_m,

@@ -63,12 +63,15 @@ class PlannedStage:
         return [path for path in dict.fromkeys(paths) if os.path.exists(path)]
 
     def parts(self) -> list[PlannedStage]:
-        """Return the stages that do its work in rounds one after the other; itself if it is one."""
+        """Return the stages that do its work in rounds one after the other; itself if it is one.
+
+        The first one alone has its tag: PDAL refuses a tag that two stages have.
+        """
         if self.ours is None:
             return [self]
-        out = []
+        out: list[PlannedStage] = []
         for changes in self.ours.parts() or ({},):
-            changed = {**self.options, **changes}
+            changed = {**self.options, **changes} | ({"tag": None} if out else {})
             options = {name: value for name, value in changed.items() if value is not None}
             stage = stage_from(options).after(self.ours.upstream) if changes else self.ours
             out.append(replace(self, options=options, ours=stage))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from functools import cached_property, partial
 
 from ..base.hashing import fingerprint
@@ -43,10 +44,22 @@ class RoundJobs:
                 block.fail_with_needed()
             for _ in self.run.do(f"{label}, blocks", self.run.unkept(blocks), self._block_task):
                 pass
-            self.run.squares += squares
+            self.run.squares += [*squares, *self._unneeded_squares(number, squares)]
         for job in waiting:
             job.fail_with_needed()
         stop_if_hopeless([job.reason for job in waiting])
+
+    def _unneeded_squares(self, number: int, needed: Sequence[TileJob]) -> list[TileJob]:
+        """Return the jobs of a round of which nothing is needed any more, with saved records.
+
+        Their arrays may be gone, but their points count in the report of the whole survey.
+        """
+        others = self._points_of_squares.keys() - {job.tile for job in needed}
+        jobs = [self._square_job(number, square) for square in sorted(others)]
+        for job in jobs:
+            known = self.run.store.note(job.name)
+            job.keep(known if known.get("fingerprint") == job.digest else {})
+        return jobs
 
     @cached_property
     def _points_of_squares(self) -> dict[tuple[int, int], int]:
