@@ -53,6 +53,7 @@ def files_in(folder, pattern="*"):
     [
         ("in", "out", 0, ["t0.laz", "t1.laz", "t2.laz"]),
         ("in/t[12].laz", "out/c_#.las", 2, ["c_t1.las", "c_t2.las"]),
+        ("in/t[12].laz", "out/#", 0, ["t1.laz", "t2.laz"]),
     ],
 )
 def test_an_output_for_each_input(folder, classify, tmp_path, given, output, workers, names):

@@ -387,6 +387,8 @@ def test_outputs_need_names(tmp_path, town_file):
     with pytest.raises(StageError, match="one of the inputs"):
         run_tiled([str(tmp_path / "a.las"), str(tmp_path / "b.las"), str(tmp_path / "#.las")], 30)
     (tmp_path / "deep").mkdir()
+    with pytest.raises(PipelineError, match="Put a suffix after it"):  # as PDAL writes text there
+        run_tiled([str(tmp_path / "a.las"), str(tmp_path / "deep" / "#")], 30)
     las[:100].write(tmp_path / "deep" / "a.las")
     with pytest.raises(PipelineError, match="the same name"):
         run_tiled(

@@ -136,8 +136,9 @@ class ClassifyTask:
             )
         self._refuse_other_dimensions()
         target = named = self.output
-        if is_folder(self.output):
-            target, named = str(Path(self.output) / ("#.laz" if self._per_tile else "#")), "x.laz"
+        if is_folder(target) or Path(target).name == "#":
+            folder = Path(target) if is_folder(target) else Path(target).parent
+            target, named = str(folder / ("#.laz" if self._per_tile else "#")), "x.laz"
         if las.named_copc(target):
             raise OptionError(
                 "runs in tiles write plain LAS or LAZ",

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
 from ..base.json_types import StageJson
 from ..base.messages import Message
@@ -180,6 +181,12 @@ def outputs_for(
     paths_of_writers = []
     for writer in plan.writers:
         name = os.path.abspath(writer["filename"])
+        if Path(name).name == "#" and not writes_las(writer):
+            raise PipelineError(
+                "the file name '#' alone takes the input's suffix, which is of LAS files",
+                found=f"{writer['type']} writes {writer['filename']}",
+                cure="Put a suffix after it, e.g. #.laz or #.txt",
+            )
         paths_of_writers.append(
             outputs_of(inputs, name) if tiles is None else named_outputs(name, tiles)
         )
