@@ -107,17 +107,21 @@ def test_damaged_records_are_none(tmp_path, text):
             assert job.state == "kept" and job.record is None and job.to_dict() == {"state": "kept"}
 
 
-def shown_messages(tiles, before=(), inputs=()):
-    """Return the messages of a run whose tiles and earlier rounds have some."""
-    jobs = [
+def jobs_with(messages_of_each, state="done"):
+    """Return jobs of tiles that have messages."""
+    return [
         TileJob(
             str(n),
-            state="done",
+            state=state,
             record=TileRecord(**{**vars(TILE), "messages": messages, "shared": []}),
         )
-        for n, messages in enumerate(tiles)
+        for n, messages in enumerate(messages_of_each)
     ]
-    return messages_of(jobs, [], inputs, before, 1000)
+
+
+def shown_messages(tiles, rounds=(), inputs=()):
+    """Return the messages of a run whose tiles and earlier rounds have some."""
+    return messages_of(jobs_with(tiles), [*map(jobs_with, rounds)], inputs, 1000)
 
 
 def test_messages_of_tiles_come_once_frequent_ones_first():
@@ -139,7 +143,10 @@ def test_that_nothing_matches_is_told_where_it_holds_for_all_tiles():
     assert shown_messages([[nothing], []]) == [] and shown_messages([[nothing], [nothing]]) == [
         "no points (2 tiles)"
     ]
-    assert shown_messages([[], []], before=[[nothing]]) == ["no points (1 tile)"]
+    assert shown_messages([[], []], [[[nothing]], [[], []]]) == ["no points (1 tile)"]
+    assert shown_messages([[], []], [[[nothing], []]]) == []
+    kept = jobs_with([[]], state="kept")
+    assert messages_of([*jobs_with([[nothing]]), *kept], [], [], 1000) == []
 
 
 def test_what_the_inputs_tell_better_is_left_out():

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -236,22 +237,25 @@ def summarize(
 
 def messages_of(
     tiles: list[TileJob],
-    squares: list[TileJob],
+    rounds: Sequence[list[TileJob]],
     inputs: Sequence[Message],
-    before: list[Sequence[Message]],
     most_points: int,
 ) -> list[str]:
-    """Return the messages about inputs, then those of tiles and of the rounds before.
+    """Return the messages about inputs, then those of tiles and of squares of the rounds before.
 
-    These come once each, frequent ones first.
+    These come once each, frequent ones first. That nothing matches is told where it holds for a
+    whole round, whatever an earlier run did of it.
     """
     done = _records_of(_finished_tiles(tiles))
     counts: Counter[Message] = Counter()
-    for lines in ([record.messages for record in done if record.points], before):
-        for message, n in Counter(each for line in lines for each in dict.fromkeys(line)).items():
+    for jobs in (tiles, *rounds):
+        every = [set(record.messages) for record in _records_of(jobs) if record.points]
+        new = [record for record in _records_of(_finished_tiles(jobs)) if record.points]
+        lines = (each for record in new for each in dict.fromkeys(record.messages))
+        for message, n in Counter(lines).items():
             if message.topic is not Topic.NOTHING_MATCHES:
                 counts[message] += n
-            elif n == len(lines):
+            elif all(message in messages for messages in every):
                 counts[message] = max(counts[message], n)
     shown = Counter({message: counts[message] for message in drop_repeated(counts)})
     if any(each.topic is Topic.NO_REFERENCE for each in inputs):  # it tells what is assumed
@@ -261,7 +265,7 @@ def messages_of(
     messages += [f"{m} ({count_of(n, 'tile')})" for m, n in shown.most_common(_MOST_MESSAGES)]
     if len(shown) > _MOST_MESSAGES:
         messages.append(f"and {len(shown) - _MOST_MESSAGES} more; see --report")
-    if short := [job.name for job in [*_finished_tiles(tiles), *squares] if job.is_short]:
+    if short := [job.name for job in [*_finished_tiles(tiles), *chain(*rounds)] if job.is_short]:
         messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
             "or terrain reach farther "

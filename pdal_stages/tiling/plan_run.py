@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import chain
 
 from ..base.hashing import fingerprint
 from ..base.messages import Message
@@ -29,10 +30,9 @@ class PlanRun(SurveyRun):
         super().__init__(survey, store, workers, show)
         self.plan = plan
         self.tiles: list[TileJob] = []  #: with points of their own, row by row
-        self.squares: list[TileJob] = []  #: of the rounds before the last
+        self.squares: list[list[TileJob]] = []  #: of each round before the last
         #: one for each input file; empty where each tile is an output
         self.outputs: list[OutputJob] = []
-        self.messages_before: list[Sequence[Message]] = []  #: of the rounds before the last
         #: How far around a tile, in units of the coordinates, inputs are available: its halo may
         #: have to grow (four halos are room for that, not tuned).
         halo_units = max(part.halo_m for part in plan.rounds) / survey.unit
@@ -44,13 +44,11 @@ class PlanRun(SurveyRun):
         summary = survey.figures(self.plan) | {
             "workers": self.workers.slots,
             "threads_per_worker": self.workers.threads,
-            **summarize(self.tiles, self.squares, self.cpu_seconds, seconds),
+            **summarize(self.tiles, [*chain(*self.squares)], self.cpu_seconds, seconds),
             "peak_mb_of_a_worker": self.peak_mb,
         }
         most = survey.options.most_points
-        messages = messages_of(
-            self.tiles, self.squares, survey.messages, self.messages_before, most
-        )
+        messages = messages_of(self.tiles, self.squares, survey.messages, most)
         changed = survey.changed()
         return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
 

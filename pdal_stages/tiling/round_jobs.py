@@ -38,13 +38,13 @@ class RoundJobs:
                 job.fail_with_needed()
             label = f"round {number + 1}"
             task_of = partial(self.run.tile_task, number)
-            for job in self.run.do(label, self.run.unkept(squares), task_of):
-                self.run.messages_before.append(job.record.messages if job.record else [])
+            for _ in self.run.do(label, self.run.unkept(squares), task_of):
+                pass
             for block in blocks:
                 block.fail_with_needed()
             for _ in self.run.do(f"{label}, blocks", self.run.unkept(blocks), self._block_task):
                 pass
-            self.run.squares += [*squares, *self._unneeded_squares(number, squares)]
+            self.run.squares.append([*squares, *self._unneeded_squares(number, squares)])
         for job in waiting:
             job.fail_with_needed()
         stop_if_hopeless([job.reason for job in waiting])
