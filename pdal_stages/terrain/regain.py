@@ -102,13 +102,16 @@ def _among_ground(cells, lowest, ground, reach, rise, least):
     out = np.zeros(len(cells), np.bool_)
     for k in range(len(cells)):
         j, i = cells[k] // w, cells[k] % w
-        measured = level = 0
+        here = lowest[j, i]
+        # The cell itself is counted below: so there is no branch to mispredict.
+        measured = level = -np.int32(here != HOLE)
+        level *= np.int32(ground[j, i])
         for b in range(max(j - reach, 0), min(j + reach + 1, h)):
             for a in range(max(i - reach, 0), min(i + reach + 1, w)):
-                if lowest[b, a] == HOLE or (a == i and b == j):
-                    continue
-                measured += 1
+                there = lowest[b, a]
                 away = np.sqrt(float((b - j) ** 2 + (a - i) ** 2))
-                level += ground[b, a] and abs(lowest[b, a] - lowest[j, i]) <= rise * away
+                leads = ground[b, a] & (abs(there - here) <= rise * away)
+                measured += np.int32(there != HOLE)
+                level += np.int32((there != HOLE) & leads)
         out[k] = measured > 0 and level >= least * measured
     return out
