@@ -141,25 +141,34 @@ def slow_towers(xyz, height, wire, rules=RULES):
     def apart(one, other, axes=3):
         return rules.cube_m * math.dist(one[:axes], other[:axes])
 
-    lowest, highest, spacing = {}, {}, {}
+    limits, out = {}, np.zeros(len(xyz), bool)
     for cube in cubes:
         near = [height[n] for w in wires for n in wires[w] if apart(w, cube, 2) <= rules.near_m]
-        if near and max(height[cubes[cube]]) > rules.head_ratio * min(near):
-            lowest[cube], highest[cube] = min(near), max(near)
+        if near:
+            cut = max(rules.min_height_m, rules.head_ratio * min(near))
+            cuts = [cut, *(max(cut, ratio * max(near)) for ratio in rules.higher_ratios)]
+            limits[cube] = cuts, max(near)
+    for number in range(1 + len(rules.higher_ratios)):
+        spacing = {}
+        for cube, (cuts, _) in limits.items():
+            if out[cubes[cube]].any() or max(height[cubes[cube]]) <= cuts[number]:
+                continue
             cell = np.floor((np.array(cube[:2]) + 0.5) * rules.cube_m / rules.density_m)
             count = (np.floor(xyz[:, :2] / rules.density_m) == cell).all(axis=1).sum()
             gap = rules.link_spacings * rules.density_m / math.sqrt(count)
             spacing[cube] = min(max(gap, rules.min_link_m), rules.max_link_m)
-    out, left = np.zeros(len(xyz), bool), set(lowest)
-    while left:
-        head, new = set(), {left.pop()}
-        while new:
-            cube = new.pop()
-            head.add(cube)
-            linked = {c for c in left if apart(c, cube) <= max(spacing[c], spacing[cube])}
-            left -= linked
-            new |= linked
-        out[slow_tower(cubes, wires, head, height, lowest, highest, apart, rules)] = True
+        left = set(spacing)
+        lowest = {cube: limits[cube][0][number] for cube in left}
+        highest = {cube: limits[cube][1] for cube in left}
+        while left:
+            head, new = set(), {left.pop()}
+            while new:
+                cube = new.pop()
+                head.add(cube)
+                linked = {c for c in left if apart(c, cube) <= max(spacing[c], spacing[cube])}
+                left -= linked
+                new |= linked
+            out[slow_tower(cubes, wires, head, height, lowest, highest, apart, rules)] = True
     return out
 
 
@@ -172,7 +181,7 @@ def slow_tower(cubes, wires, head, height, lowest, highest, apart, rules):
         1 + np.ptp([a * column + b * row for column, row, _ in head]) / length
         for a, b, length in directions
     )
-    begins = rules.head_ratio * min(map(lowest.get, head)) + rules.max_bottom_ratio * top
+    begins = min(map(lowest.get, head)) + rules.max_bottom_ratio * top
     if (
         len(points) < rules.min_points
         or width > rules.max_width_m

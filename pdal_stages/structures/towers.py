@@ -8,7 +8,9 @@ of the absolute grid, so that their order does not matter, and any tile that hol
    cut off so, and what grows at a tower's feet.
 2. A head is a tower's where it touches wires, is slender, begins near that height and reaches the
    highest wire near. Trees that grow into a line do not.
-3. With it goes what stands under its middle.
+3. Of what is left, cubes higher than a share of the highest wire are linked and judged so, with
+   one share after the other: towers that stand beside crowns and roofs come free of them higher up.
+4. With a head goes what stands under its middle.
 """
 
 from __future__ import annotations
@@ -35,9 +37,9 @@ class TowerRules:
     cube_m: float = 1.0  #: side of the cubes; distances between cubes are those of their corners
     min_height_m: float = 3.0  #: what is lower stays what it is: shrubs, cars and fences
     near_m: float = 10.0  #: wires so far away, in plan, are near: half the widest tower
-    head_ratio: float = (
-        0.4  #: share of the lowest wire's height above which a cube is part of a head
-    )
+    #: share of the lowest wire's height above which a cube is part of a head, ...
+    head_ratio: float = 0.4
+    higher_ratios: tuple[float, ...] = (0.5, 0.7)  #: ... and then shares of the highest wire's
     touch_m: float = 2.5  #: from a wire to what it hangs at: insulators, gaps between echoes
     #: gaps that cubes are linked across, in distances between points as the density has them, ...
     link_spacings: float = 8.0
@@ -52,7 +54,7 @@ class TowerRules:
     min_top_ratio: float = 0.9
     max_bottom_ratio: float = 0.25  #: how far above the cut a head may begin, over its top, ...
     max_bottom_m: float = 6.0  #: ... where that is higher than this: poles have few echoes
-    core_ratio: float = 0.25  #: radius of what stands under a head, over its width, ...
+    core_ratio: float = 0.1  #: radius of what stands under a head, over its width, ...
     min_core_m: float = 1.5  #: ... and at least
 
     @property
@@ -104,13 +106,16 @@ def find_towers(
     for _, _, near_wire in _steps(keys, wire_keys, rules.touch_m, cubes.key, rules):
         touching[near_wire] = True
     lowest, highest = _wires_near(keys, cubes, wire_places, height[wires], rules)
-    head = np.flatnonzero(cubes.top > np.maximum(rules.min_height_m, rules.head_ratio * lowest))
-    if not touching[head].any():
-        return is_tower
-    link = _link_lengths(xyz[near, :2], cubes.place[head], rules)
-    label = _link(keys, cubes.key[head], link, rules)
-    wires_near = lowest[head], highest[head]
-    chosen = _judge(cubes, head, label, wires_near, touching[head], rules)
+    chosen = np.zeros(len(cubes.key), np.bool_)
+    lowest_cut = np.maximum(rules.min_height_m, rules.head_ratio * lowest)
+    higher = (np.maximum(lowest_cut, ratio * highest) for ratio in rules.higher_ratios)
+    for cut in (lowest_cut, *higher):
+        head = np.flatnonzero(~chosen & (cubes.top > cut))
+        if not touching[head].any():
+            continue
+        link = _link_lengths(xyz[near, :2], cubes.place[head], rules)
+        label = _link(keys, cubes.key[head], link, rules)
+        chosen |= _judge(cubes, head, label, (cut[head], highest[head]), touching[head], rules)
     is_tower[standing] = chosen[cubes.of_point]
     return is_tower
 
@@ -279,11 +284,12 @@ def _link(keys, key, link, rules) -> NDArray[np.int64]:
     return label
 
 
-def _judge(cubes, head, label, wires_near, touching, rules) -> NDArray[np.bool_]:
+def _judge(cubes, head, label, limits, touching, rules) -> NDArray[np.bool_]:
     """Return which cubes (k,) are of towers: heads that are, and what stands under them.
 
     Of the cubes of heads (h,) `head` are their rows, `label` the heads that they are part of,
-    `wires_near` the lowest and the highest wire near, `touching` which touch wires.
+    `limits` the height above which they are and that of the highest wire near, `touching` which
+    touch wires.
     """
     count = int(label.max()) + 1
     place, top = cubes.place[head], cubes.top[head]
@@ -294,13 +300,13 @@ def _judge(cubes, head, label, wires_near, touching, rules) -> NDArray[np.bool_]
         return out
 
     size, highest, bottom = np.bincount(label), -lowest(-top), lowest(cubes.bottom[head])
-    low_wire, high_wire = lowest(wires_near[0]), -lowest(-wires_near[1])
+    cut, high_wire = lowest(limits[0]), -lowest(-limits[1])
     width = np.zeros(count)
     for (column, row), length in _DIRECTIONS:
         along = column * place[:, 0] + row * place[:, 1]
         width = np.maximum(width, (-lowest(-along) - lowest(along)) / length)
     width = (width + 1.0) * rules.cube_m
-    begin = rules.head_ratio * low_wire + rules.max_bottom_ratio * highest
+    begin = cut + rules.max_bottom_ratio * highest
     good = (
         (np.bincount(label, touching) > 0)
         & (np.bincount(label, cubes.points[head]) >= rules.min_points)
