@@ -42,7 +42,7 @@ def number_spans(cubes: WireCubes) -> NDArray[np.int64]:
     close = tree.query_pairs(GAP, output_type="ndarray")
     touching = cKDTree(cubes.place).query_pairs(1.0, p=math.inf, output_type="ndarray")
     pairs = np.concatenate([close, touching])
-    count = number_sets(pairs[:, 0], pairs[:, 1], label)
+    count = _join(pairs, label)
     tube = max(TUBE, cubes.size)
     ahead = [pairs]
     for rows in _members(label, count):
@@ -53,11 +53,16 @@ def number_spans(cubes: WireCubes) -> NDArray[np.int64]:
             beside = np.linalg.norm(away - np.outer(along, direction), axis=1)
             met = other[(along > 0) & (beside <= tube) & (label[other] != label[tip])]
             ahead.append(np.column_stack([np.full(len(met), tip), met]))
-    pairs = np.concatenate(ahead)
-    number_sets(pairs[:, 0], pairs[:, 1], label)
+    _join(np.concatenate(ahead), label)
     large = np.bincount(label) >= MIN_CUBES
     number = np.where(large, np.cumsum(large) - 1, -1)
     return number[label]
+
+
+def _join(pairs: NDArray[np.int64], label: NDArray[np.int64]) -> int:
+    """Give each set (n,) that pairs (m, 2) of rows join a number; return how many there are."""
+    first, second = np.ascontiguousarray(pairs.T)
+    return int(number_sets(first, second, label))
 
 
 def _members(label: NDArray[np.int64], count: int) -> Sequence[NDArray[np.int64]]:
