@@ -31,7 +31,7 @@ def shorten(text: str, most: int = 200) -> str:
 
 
 class Topic(Enum):
-    """What a message is about, where that decides who shows it."""
+    """Subjects of messages that decide who shows them."""
 
     OTHER = "other"
     #: a file as it is read: runs in tiles report on the inputs, not on what is cut from these

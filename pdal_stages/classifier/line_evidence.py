@@ -71,7 +71,7 @@ REACH = 2.0 * (RULES.radius + math.sqrt(2.0) * RULES.cube)
 
 
 class _Parts(NamedTuple):
-    """What lines are made of: one candidate of each cube, cell by cell."""
+    """Parts of lines: one candidate of each cube, cell by cell."""
 
     xyz: npt.NDArray[np.float64]  #: (m, 3)
     probability: npt.NDArray[np.float32]  #: (m,) of being part of a line
@@ -100,8 +100,8 @@ def find_lines(
     if not len(guides):
         return on_line
     cells = cell_keys(*(cell_numbers(xyz[:, axis], RULES.radius) for axis in (0, 1)))
-    around = _cells_around(_cells_around(cells[guides]))
-    rows = np.flatnonzero(places_among(around, cells)[1])
+    near = _cells_around(_cells_around(cells[guides]))
+    rows = np.flatnonzero(places_among(near, cells)[1])
     parts = rows[_likeliest(xyz[rows], probability[rows])]
     guides = parts[probability[parts] >= RULES.likely]
     look = partial(_look, xyz, probability, cells, parts, threads=threads)
@@ -226,11 +226,11 @@ def _near(point, cell, parts, radius):
 def _evidence_in_tube(near, n, line, width):
     """Return what n parts in the tube count, the more the nearer they are to its axis."""
     u, v, rise = line
-    one, scale, total = np.float32(1.0), np.float32(1.0 / width**2), np.float32(0.0)
+    whole, scale, total = np.float32(1.0), np.float32(1.0 / width**2), np.float32(0.0)
     for k in range(n):
         along = near[0, k] * u + near[1, k] * v
         aside, above = near[1, k] * u - near[0, k] * v, near[2, k] - along * rise
-        total += near[3, k] * max(np.float32(0.0), one - scale * (aside * aside + above * above))
+        total += near[3, k] * max(np.float32(0.0), whole - scale * (aside * aside + above * above))
     return total
 
 

@@ -29,7 +29,7 @@ class _FileTask(Generic[_Result]):
 
 @dataclass(frozen=True)
 class _FileResult(Generic[_Result]):
-    """What was read of a file."""
+    """Result of reading a file."""
 
     number: int  #: of the file
     result: _Result

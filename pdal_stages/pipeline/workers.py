@@ -37,7 +37,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Cost:
-    """What a task took."""
+    """Time and memory that a task took."""
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0

@@ -24,7 +24,7 @@ _SQUARE_M = 64.0
 
 
 class _Reasons(NamedTuple):
-    """What a pass read of a point."""
+    """Inputs that a pass read of a point, and what they added."""
 
     probabilities: NDArray[np.float64]  #: (classes,)
     values: NDArray[np.float32]  #: (inputs,)
@@ -33,7 +33,7 @@ class _Reasons(NamedTuple):
 
 @dataclass
 class _FirstPass(ModelObserver):
-    """What the first pass of a model makes of points."""
+    """Observer of the first pass of a model."""
 
     model: Model
     reasons: dict[int, _Reasons] = field(default_factory=dict)  #: by the row of a point
@@ -85,8 +85,8 @@ def inputs_against(
     model : Model
     """
     squares = _cells(places, _SQUARE_M)
-    around = [squares + key_offset(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    near = np.isin(_cells(points["xyz"], _SQUARE_M), np.unique(around))
+    squares_near = [squares + key_offset(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    near = np.isin(_cells(points["xyz"], _SQUARE_M), np.unique(squares_near))
     xyz, codes = points["xyz"][near], points["codes"][near]
     cells, wanted = _cells(xyz, side), _cells(places, side)
     rows = np.flatnonzero(np.isin(cells, wanted))

@@ -114,7 +114,7 @@ class _Cloud:
         is_classified = any(RELIABILITY.name in layout.fields for layout in layouts)
         needed = Reaches.of_stages(stages, is_classified)
         xy = np.array([place[:2] for place in places])
-        fitting = unit * _reach_that_fits(self.headers, xy, needed.around / unit)
+        fitting = unit * _reach_that_fits(self.headers, xy, needed.outer / unit)
         reaches = needed.limited(fitting)
         far: list[NDArray[np.float64]] = [np.empty((0, 3))]
 
@@ -126,7 +126,7 @@ class _Cloud:
 
         near, outer, inner = (
             box_around(xy, reach_m / unit)
-            for reach_m in (reaches.around, reaches.far, reaches.inner)
+            for reach_m in (reaches.outer, reaches.far, reaches.inner)
         )
         names = None if where else _READ
         cloud = read_around(self.files, near, outer, inner, names, reduce)
@@ -134,7 +134,7 @@ class _Cloud:
         rows = np.array([row for row, _ in nearest])
         recording = Recording(cloud, self.reference, where, rows)
         recording.run(pipeline, reaches, far)
-        if fitting < needed.around:
+        if fitting < needed.outer:
             lost = "only the lowest of each place count" if reaches.ground else "are not read"
             recording.notes.append(f"{_TOO_MANY} {fitting:.0f} m {lost}")
         return recording, [away for _, away in nearest]

@@ -38,7 +38,7 @@ _OF_RESULTS = ("HeightAboveGround", "Reliability", "Checked")
 
 @dataclass(frozen=True)
 class Reaches:
-    """How far around the points that are explained others matter, in meters.
+    """Distances up to which others matter around the points that are explained, in meters.
 
     The first stages, such as noise, run on all points around. The ground filter, where it is not
     given its ground, takes of points far away the lowest of coarse cells. It classifies cells, and
@@ -52,7 +52,7 @@ class Reaches:
     lines: float  #: what the model looks at among its results, where one may lie on a line
     near: float  #: what the stages from the first one on look at
     inner: float  #: within which results of the stages before it count
-    around: float  #: what these look at
+    outer: float  #: what these look at
     far: float  #: what the ground filter looks at
 
     @classmethod
@@ -80,16 +80,16 @@ class Reaches:
         if ground is not None and blocks is not None:
             inner += ground.reach_near_m
             far += blocks.margin + blocks.reach
-        around = inner + sum(reaches[:first])
+        outer = inner + sum(reaches[:first])
         lines = sum(s.model.reach_of_lines_m for s in stages if isinstance(s, ApplyModel))
-        return cls(first, model, ground, used, lines, near, inner, around, max(far, around))
+        return cls(first, model, ground, used, lines, near, inner, outer, max(far, outer))
 
     def limited(self, limit: float) -> Reaches:
         """Return these where points farther away than a limit count as far."""
-        around = min(self.around, limit)
-        inner = min(around, max(self.near, around - (self.around - self.inner)))
-        far = self.far if self.ground is not None else around
-        return replace(self, inner=inner, around=around, far=far)
+        outer = min(self.outer, limit)
+        inner = min(outer, max(self.near, outer - (self.outer - self.inner)))
+        far = self.far if self.ground is not None else outer
+        return replace(self, inner=inner, outer=outer, far=far)
 
 
 #: What each step of the ground filter made of a piece of the cloud, by its name.
@@ -134,26 +134,26 @@ class Recording(Observer):
         ours = pipeline.expanded.ours
         for each in ours:
             each.update_context(observer=self)
-        around, known = self.cloud, selection(self.where, self.cloud)
+        cloud, known = self.cloud, selection(self.where, self.cloud)
         try:
-            seen = run_stages(ours[: reaches.first], around, wkt, known, self._keep_classes)
+            seen = run_stages(ours[: reaches.first], cloud, wkt, known, self._keep_classes)
         except NoTerrainError as error:
             raise NoTerrainError(
                 f"around the place {error.what}",
-                found=f"{len(around.number):,} points, all that are read",
+                found=f"{len(cloud.number):,} points, all that are read",
                 cure="Explain places nearer to ground, or leave --ground given out",
             ) from None
-        near = _rows_in(around, self._box(reaches.near / unit))
+        near = _rows_in(cloud, self._box(reaches.near / unit))
         if (ground := reaches.ground) is not None:
             candidates = ground_candidates(ground, seen, wkt)
             x, y, _ = candidates
             inner = inside_box(x, y, [unit * side for side in self._box(reaches.inner / unit)])
-            places = unit * np.column_stack([around[axis][self.rows] for axis in "XY"])
+            places = unit * np.column_stack([cloud[axis][self.rows] for axis in "XY"])
             blocks = ground.cells_near(
                 candidates[:, inner], np.concatenate([*far]), places, reaches.near
             )
             ours[reaches.first].update_context(blocks=blocks)
-        self.cloud, self.rows = around.take(near), np.searchsorted(near, self.rows)
+        self.cloud, self.rows = cloud.take(near), np.searchsorted(near, self.rows)
         self.cloud.load(_OF_RESULTS)
         xy = np.column_stack([self.cloud[axis] for axis in "XY"])
         outside = unit * cKDTree(xy[self.rows]).query(xy, p=np.inf)[0]
@@ -174,8 +174,8 @@ class Recording(Observer):
             seen = run_stages(after, self.cloud, wkt, known, self._keep_classes)
         self.results = SomeRows(seen, self.rows)
         texts = [*pipeline.expanded.warnings, *pipeline.messages]
-        told = (str(each) for each in texts if each.topic is not Topic.OTHER_DENSITY)
-        self.notes = [*dict.fromkeys(told)]
+        shown = (str(each) for each in texts if each.topic is not Topic.OTHER_DENSITY)
+        self.notes = [*dict.fromkeys(shown)]
 
     def _box(self, reach: float) -> Box:
         """Return the box of the points in question, wider by a reach in units of coordinates."""
