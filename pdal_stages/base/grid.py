@@ -93,6 +93,12 @@ def key_offset(columns: int, rows: int) -> int:
     return (rows << _ROW_SHIFT) + columns
 
 
+def cells_around(keys: Integers) -> Integers:
+    """Return the keys, ascending and each once, of some cells and of those that touch them."""
+    offsets = [key_offset(column, row) for column in (-1, 0, 1) for row in (-1, 0, 1)]
+    return np.unique(np.add.outer(np.unique(keys), offsets))
+
+
 def split_keys(keys: Integers) -> tuple[Integers, Integers, Integers]:
     """Return column, row and layer of keys of cells, whose rows lie below 2**26."""
     layer = (keys + (1 << (_LAYER_SHIFT - 1))) >> _LAYER_SHIFT

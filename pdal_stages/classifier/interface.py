@@ -127,11 +127,6 @@ class Block(NamedTuple):
     #: (b,) variance of a class's probability over a network's batches, mean over the classes
     variance: npt.NDArray[np.float64] | None = None
 
-    def take(self, which: npt.NDArray[np.bool_]) -> Block:
-        """Return some of the points; `which` (b,) tells them."""
-        variance = None if self.variance is None else self.variance[which]
-        return Block(self.rows[which], self.probabilities[which], variance)
-
 
 def weigh(
     p: npt.NDArray[np.float64], factors: npt.NDArray[np.float64] | None

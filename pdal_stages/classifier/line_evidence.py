@@ -28,11 +28,13 @@ from ..base.grid import (
     begins_run,
     cell_keys,
     cell_numbers,
+    cells_around,
     compact_keys,
     key_offset,
     places_among,
 )
 from ..base.jit import device, njit
+from ..base.key_order import order_by_key
 from ..base.threads import map_blocks
 
 Rows = npt.NDArray[np.int64]
@@ -100,28 +102,22 @@ def find_lines(
     if not len(guides):
         return on_line
     cells = cell_keys(*(cell_numbers(xyz[:, axis], RULES.radius) for axis in (0, 1)))
-    near = _cells_around(_cells_around(cells[guides]))
+    near = cells_around(cells_around(cells[guides]))
     rows = np.flatnonzero(places_among(near, cells)[1])
     parts = rows[_likeliest(xyz[rows], probability[rows])]
     guides = parts[probability[parts] >= RULES.likely]
     look = partial(_look, xyz, probability, cells, parts, threads=threads)
     guides = guides[look(guides, guides)]
     if len(guides):
-        points = np.flatnonzero(places_among(_cells_around(cells[guides]), cells)[1])
+        points = np.flatnonzero(places_among(cells_around(cells[guides]), cells)[1])
         on_line[points] = look(guides, points)
     return on_line
-
-
-def _cells_around(cells: Rows) -> Rows:
-    """Return the keys, ascending, of some cells and of the cells that touch these."""
-    steps = [key_offset(column, row) for column in (-1, 0, 1) for row in (-1, 0, 1)]
-    return np.unique(np.add.outer(np.unique(cells), steps))
 
 
 def _likeliest(xyz: npt.NDArray[np.float64], probability: npt.NDArray[np.float32]) -> Rows:
     """Return the row of the likeliest point of each cube, cube by cube."""
     keys = compact_keys(xyz, RULES.cube)[0]
-    order = np.argsort(keys, kind="stable")
+    order = order_by_key(keys)
     begin = np.flatnonzero(begins_run(keys[order]))
     rows = np.empty(len(begin), np.int64)
     _pick(xyz, probability, order, begin, rows)
@@ -145,7 +141,7 @@ def _look(
     steps = np.array([key_offset(-1, row) for row in (-1, 0, 1)])
     every = []
     for rows in (parts, guides):
-        rows = rows[np.argsort(cells[rows], kind="stable")]
+        rows = rows[order_by_key(cells[rows])]
         ends = (np.searchsorted(cells[rows], home[:, None] + steps + more) for more in (0, 3))
         every.append(_Parts(xyz[rows], probability[rows], *ends))
     out = np.zeros(len(points), np.bool_)

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..base.grid import GridWindow, cell_keys, split_keys
+from ..base.grid import GridWindow, cell_keys, group_by_key, split_keys
 from ..base.hashing import hash_rows
 from ..base.json_types import JsonObject
 from ..base.progress import Progress
@@ -145,8 +145,9 @@ def _find_spans(
     column, row, _ = wires.place.T
     below = ground[np.searchsorted(wire_cells, cell_keys(column, row, Kind.SPAN))]
     values = wires.columns
-    order = np.argsort(number, kind="stable")[np.count_nonzero(number < 0) :]
-    for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else ():
+    for rows in group_by_key(number):
+        if number[rows[0]] < 0:
+            continue
         cells = ObjectCells(
             row[rows],
             column[rows],

@@ -8,12 +8,13 @@ Cubes are those of an absolute grid and sorted, so that the order of points chan
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..base.grid import group_by_key
 from ..terrain.components import number_sets
 from .cells import WireCubes
 
@@ -42,10 +43,10 @@ def number_spans(cubes: WireCubes) -> NDArray[np.int64]:
     close = tree.query_pairs(GAP, output_type="ndarray")
     touching = cKDTree(cubes.place).query_pairs(1.0, p=math.inf, output_type="ndarray")
     pairs = np.concatenate([close, touching])
-    count = _join(pairs, label)
+    _join(pairs, label)
     tube = max(TUBE, cubes.size)
     ahead = [pairs]
-    for rows in _members(label, count):
+    for rows in group_by_key(label):
         for tip, direction in _ends(middles, rows):
             other = np.array(tree.query_ball_point(middles[tip], AHEAD))
             away = middles[other] - middles[tip]
@@ -59,16 +60,10 @@ def number_spans(cubes: WireCubes) -> NDArray[np.int64]:
     return number[label]
 
 
-def _join(pairs: NDArray[np.int64], label: NDArray[np.int64]) -> int:
-    """Give each set (n,) that pairs (m, 2) of rows join a number; return how many there are."""
+def _join(pairs: NDArray[np.int64], label: NDArray[np.int64]) -> None:
+    """Give each set (n,) that pairs (m, 2) of rows join a number, from 0."""
     first, second = np.ascontiguousarray(pairs.T)
-    return int(number_sets(first, second, label))
-
-
-def _members(label: NDArray[np.int64], count: int) -> Sequence[NDArray[np.int64]]:
-    """Return the rows of each label."""
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
+    number_sets(first, second, label)
 
 
 def _ends(

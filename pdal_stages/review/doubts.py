@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION
-from ..base.grid import begins_run, cell_keys, cell_numbers, key_offset
+from ..base.grid import begins_run, cell_keys, cell_numbers, cells_around
 from ..classifier.feature_forest import FeatureForest
 from ..classifier.interface import ModelObserver, PassInputs
 from ..classifier.model import Model
@@ -84,9 +84,8 @@ def inputs_against(
         Of the cells that the places lie in, meters.
     model : Model
     """
-    squares = _cells(places, _SQUARE_M)
-    squares_near = [squares + key_offset(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    near = np.isin(_cells(points["xyz"], _SQUARE_M), np.unique(squares_near))
+    squares = cells_around(_cells(places, _SQUARE_M))
+    near = np.isin(_cells(points["xyz"], _SQUARE_M), squares)
     xyz, codes = points["xyz"][near], points["codes"][near]
     cells, wanted = _cells(xyz, side), _cells(places, side)
     rows = np.flatnonzero(np.isin(cells, wanted))

@@ -153,7 +153,8 @@ def _ground(recording: Recording, place: int) -> GroundSteps | None:
     lower = cloud["Z"][near] * units.vertical < z - _LOWER_M
     lowest = elevation("low_outliers" if "low_outliers" in piece else "minimum_grid")
     floor, land = elevation("openings"), elevation("wide_roofs")
-    lowest_near, given = elevation("low_outliers", round(_NEAR_M / cell)), elevation("given_ground")
+    lowest_near = elevation("low_outliers", round(_NEAR_M / cell))
+    mean = elevation("given_ground")
     rounds = [elevation(name) is not None for name in piece if name.startswith("round_")]
     lowered = 0.0 if lowest is None or floor is None else lowest - floor
     roof = 0.0 if floor is None or land is None else floor - land
@@ -170,9 +171,9 @@ def _ground(recording: Recording, place: int) -> GroundSteps | None:
         has_steps=lowest is not None and not stage.given_ground,
         is_object=lowered > 0 or roof > 0,
         is_given=stage.given_ground,
-        given=given,
+        given=mean,
         lowest_near=lowest_near,
-        raised=0.0 if given is None else given - (lowest_near or 0.0),
+        raised=0.0 if mean is None else mean - (lowest_near or 0.0),
         near=len(lower),
         lower=int(np.count_nonzero(lower)),
         has_noise=not len(recording.noise),

@@ -26,14 +26,18 @@ Integers = NDArray[np.int64]
 STEPS = 1000
 #: Height of a cell without points, in steps: below all heights, and no sum overflows.
 EMPTY = np.iinfo(np.int64).min // 4
-#: Ground points that are kept along a side of a cell, and the largest side of which one is kept,
-#: meters: the RMSE at held-out ground of four clouds rose by at most 0.026 m over that of all
-#: points, with one of each meter by 0.043 (benchmarks/terrain_points.py).
-PER_SIDE, LARGEST_SIDE = 2, 0.5
+#: Ground points that are kept along a side of a cell.
+PER_SIDE = 2
+#: Largest side of which one is kept, meters: the RMSE at held-out ground of four clouds rose by at
+#: most 0.026 m over that of all points, with one of each meter by 0.043
+#: (benchmarks/terrain_points.py).
+LARGEST_SIDE = 0.5
 #: Most cells along a tile: in those without points time and memory are spent, too (not tuned).
 MOST_ALONG = 2048
-#: Bytes of a cell of the rasters, and of a ground point that is triangulated, of measured peaks.
-_CELL_BYTES, _GROUND_BYTES = 150, 1200
+#: Bytes of a cell of the rasters, of measured peaks ...
+_CELL_BYTES = 150
+#: ... and of a ground point that is triangulated.
+_GROUND_BYTES = 1200
 
 
 @dataclass(frozen=True)

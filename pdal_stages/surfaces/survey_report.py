@@ -44,8 +44,10 @@ from .survey_cells import (
 )
 from .triangulation import Box, heights_at
 
-#: Width of pictures in pixels, and voids and control points that are listed, as many as fit a page.
-_WIDTH, _LISTED = 820, 10
+#: Width of pictures in pixels.
+_WIDTH = 820
+#: Voids and control points that are listed, as many as fit a page.
+_LISTED = 10
 #: NSSDA: 95 % of normally distributed errors are smaller than this times their RMSE.
 NSSDA = 1.96
 #: x, y, z and name of a control point.

@@ -28,14 +28,23 @@ Integers = NDArray[np.int64]
 Box = tuple[float, float, float, float]
 #: Relative error of a determinant in doubles, rounded up (Shewchuk 1997: about 1.1e-15).
 _ROUNDING = 1e-14
-#: Parts of the reach: within the first points are read at once. Beyond it they are read around
-#: open cells, in pieces that need no wider box, if that is at least the second wide.
-NEAR, SPLIT = 1 / 8, 2.5
-#: How triangles count: their circles reach beyond the known points; they give heights; they are too
-#: wide, so there is no height.
-UNKNOWN, VALID, TOO_WIDE = 0, 1, 2
-#: Where a place lies as seen from a triangle; a side belongs to both triangles of it.
-OUTSIDE, INSIDE, ON_SIDE = 0, 1, 2
+#: Part of the reach within which points are read at once.
+NEAR = 1 / 8
+#: Beyond it they are read around open cells, in pieces that need no wider box, if that is at least
+#: so many reaches wide.
+SPLIT = 2.5
+#: State of a triangle whose circle reaches beyond the known points.
+UNKNOWN = 0
+#: State of one that gives heights.
+VALID = 1
+#: State of one that is too wide, so there is no height.
+TOO_WIDE = 2
+#: A place lies outside a triangle.
+OUTSIDE = 0
+#: A place lies inside a triangle.
+INSIDE = 1
+#: A place lies on a side, which belongs to both of its triangles.
+ON_SIDE = 2
 
 
 def triangulate(xy: Integers) -> Integers:
@@ -71,18 +80,18 @@ def _fan_circles(xy: Integers, triangles: Integers) -> Integers:
     key = sides.min(axis=1) * len(xy) + sides.max(axis=1)
     order = np.argsort(key, kind="stable")
     shared = np.flatnonzero(~begins_run(key[order]))
-    one, two = order[shared - 1], order[shared]
-    on_circle = _on_one_circle(xy, triangles[owner[one]], opposite[two])
-    one, two = one[on_circle], two[on_circle]
+    left, right = order[shared - 1], order[shared]
+    on_circle = _on_one_circle(xy, triangles[owner[left]], opposite[right])
+    left, right = left[on_circle], right[on_circle]
     count = len(triangles)
-    pairs = coo_array((np.ones(len(one)), (owner[one], owner[two])), shape=(count, count))
+    pairs = coo_array((np.ones(len(left)), (owner[left], owner[right])), shape=(count, count))
     circle = connected_components(pairs, directed=False)[1]
     # Each circle's first point is joined to the sides of its polygon, which lie in no two of its
     # triangles.
     first = np.full(count, len(xy))
     np.minimum.at(first, circle, triangles.min(axis=1))
     several, outer = np.bincount(circle)[circle] > 1, np.ones(len(owner), bool)
-    outer[one] = outer[two] = False
+    outer[left] = outer[right] = False
     apex = first[circle[owner]]
     fan = outer & several[owner] & (sides != apex[:, None]).all(axis=1)
     return np.concatenate([triangles[~several], np.column_stack([apex, sides])[fan]])
@@ -264,19 +273,19 @@ def _height_in(points, a, b, c, x, y):
     ac = _area(points, a, c, x, y)
     if not ((ab >= 0 and bc >= 0 and ac <= 0) or (ab <= 0 and bc <= 0 and ac >= 0)):
         return 0.0, OUTSIDE
-    for one, two, area in ((a, b, ab), (b, c, bc), (a, c, ac)):
+    for left, right, area in ((a, b, ab), (b, c, bc), (a, c, ac)):
         if area == 0:
-            dx, dy = points[two, 0] - points[one, 0], points[two, 1] - points[one, 1]
-            part = (x - points[one, 0]) / dx if abs(dx) >= abs(dy) else (y - points[one, 1]) / dy
-            return points[one, 2] + part * (points[two, 2] - points[one, 2]), ON_SIDE
+            dx, dy = points[right, 0] - points[left, 0], points[right, 1] - points[left, 1]
+            part = (x - points[left, 0]) / dx if abs(dx) >= abs(dy) else (y - points[left, 1]) / dy
+            return points[left, 2] + part * (points[right, 2] - points[left, 2]), ON_SIDE
     whole = ab + bc - ac
     rise = -ac * (points[b, 2] - points[a, 2]) + ab * (points[c, 2] - points[a, 2])
     return points[a, 2] + rise / whole, INSIDE
 
 
 @njit
-def _area(points, one, two, x, y):
+def _area(points, left, right, x, y):
     """Return twice the signed area of two points and a place."""
-    return (points[two, 0] - points[one, 0]) * (y - points[one, 1]) - (
-        points[two, 1] - points[one, 1]
-    ) * (x - points[one, 0])
+    return (points[right, 0] - points[left, 0]) * (y - points[left, 1]) - (
+        points[right, 1] - points[left, 1]
+    ) * (x - points[left, 0])
