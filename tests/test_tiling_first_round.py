@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import laspy
 import numpy as np
 import pytest
@@ -211,3 +213,31 @@ def test_blocks_put_together_give_the_ground_of_the_whole(origin, cell, window, 
         assert core.any()
         for name, values in subset.items():
             assert np.array_equal(values[core], whole[name][near][core]), (box, name)
+
+
+@pytest.mark.pdal
+def test_a_resumed_run_reports_what_an_uninterrupted_one_does(tmp_path, survey, monkeypatch):
+    """Messages and counts of what is kept are in it; what has a damaged record is done again."""
+    stages = [{"type": "filters.detachednoise"}, HEIGHTS]
+    run = in_tiles(survey, stages, tmp_path / "at_once")
+    expected = [run.messages, *(run.summary[name] for name in ("classes", "point_counts"))]
+    assert any("meters were assumed" in text for text in run.messages) and all(expected)
+    folder = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        failing_in(patch, (1, 1, 1))
+        assert in_tiles(survey, stages, folder).failures
+    begun = failing_in(monkeypatch)
+
+    def resume() -> list[tuple[int, ...]]:
+        """Resume the run, and return which tiles and squares it did."""
+        begun.clear()
+        run = in_tiles(survey, stages, folder, resume=True)
+        assert [run.messages, *(run.summary[n] for n in ("classes", "point_counts"))] == expected
+        return begun.copy()
+
+    assert (1, 1, 1) in resume() and resume() == []
+    kept = folder / ".pdal-stages" / "kept"
+    for name in ("0_0.round0", "160_160"):
+        record = json.loads((kept / f"{name}.json").read_text())
+        (kept / f"{name}.json").write_text(json.dumps({**record, "messages": [], "points": 1}))
+    assert resume() == [(0, 0, 0), (1, 1, 1)] and resume() == []

@@ -93,6 +93,19 @@ def test_a_job_is_kept_by_the_next_run(tmp_path):
         assert store.finished("a", "d") is None and store.edited("a") == [str(out)]
 
 
+def test_a_record_that_is_not_what_was_saved_is_none(tmp_path):
+    """It is valid, and names the same digest, but a value is another."""
+    with Store(tmp_path) as store:
+        store.finish("a", TILE.to_json(), "d")
+        saved = store.record("a", "d")
+        assert TileRecord.from_json(saved) == TILE and store.record("a", "e") is None
+        path = store.kept / "a.json"
+        for name, value in (("points", 11), ("classes", {}), ("fingerprint", "e"), ("more", 1)):
+            path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+            assert store.record("a", "d") is store.record("a", "e") is None
+            store.finish("a", TILE.to_json(), "d")
+
+
 @pytest.mark.parametrize(
     "text", ["", "[]", '{"outputs": 5}', '{"outputs": [[1]]}', '{"outputs": {}}']
 )

@@ -69,6 +69,7 @@ class CloudIndex(JobRecord):
     digest: str  #: SHA-256 of the input
     changed_ns: int  #: time of the input's last change of content or status, which no program sets
     squares: NDArray[np.int64]  #: (k, 3): column and row in :attr:`Survey.lone_grid`, points
+    warning: str = ""  #: about points outside the box in the header
     copy: str = ""  #: the file with the points; empty where an earlier run had it
 
     def to_json(self) -> JsonObject:
@@ -80,14 +81,13 @@ class CloudIndex(JobRecord):
 
     @classmethod
     def from_json(cls, saved: JsonObject) -> CloudIndex:
-        """Return an index without its copy; ValueError, TypeError, ... where it is damaged."""
+        """Return the index that was saved, without its copy."""
         cells = np.array(saved["cells"], np.int64).reshape(-1, 4)
         tiles = [(i, j, n) for i, j, n in saved["tiles"]]
         grid = TileGrid(*map(float, saved["grid"]))
-        digest, changed_ns = str(saved["digest"]), int(saved["changed_ns"])
-        box = tuple(saved["box"])
         squares = np.array(saved["squares"], np.int64).reshape(-1, 3)
-        return cls(int(saved["count"]), box, tiles, cells, grid, digest, changed_ns, squares)
+        arrays = {"box": tuple(saved["box"]), "tiles": tiles, "cells": cells, "squares": squares}
+        return super().from_json({**saved, **arrays, "grid": grid})
 
     def is_of(self, path: str) -> bool:
         """Return whether the input still holds the bytes that were read.
@@ -264,6 +264,11 @@ class Survey:
         self.messages += map(Message, copies_among(self.sources))
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
         self.messages += [Message(f"{text}{more}", Topic.INPUT) for text in odd[:1]]
+
+    def warnings_of_boxes(self) -> list[Message]:
+        """Return warnings about inputs with points outside the box in their header."""
+        indexes = [source.index for source in self.sources if source.index]
+        return [Message(index.warning) for index in indexes if index.warning]
 
     def measure_density(self) -> Density:
         """Return the density of the inputs, by which tiles are chosen."""

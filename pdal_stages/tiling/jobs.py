@@ -23,6 +23,7 @@ from ..base.checks import strict_json
 from ..base.columns import LazyColumns
 from ..base.errors import StageError
 from ..base.files import make_own_folder, try_lock, whole_files
+from ..base.hashing import fingerprint
 from ..base.json_types import JsonObject
 from ..base.messages import Message, Topic, count_of, drop_repeated
 from ..base.version import __version__
@@ -83,7 +84,7 @@ class Job:
             self.fail(reason)
 
     def keep(self, saved: JsonObject) -> None:
-        """Mark it as kept from an earlier run, with what that saved, unless it is damaged."""
+        """Mark it as kept from an earlier run, with what that saved, if this version reads it."""
         self.state = "kept"
         with contextlib.suppress(TypeError, KeyError, ValueError):
             self.record = self.record_type.from_json(saved)
@@ -205,16 +206,11 @@ def _records_of(jobs: Iterable[TileJob]) -> list[TileRecord]:
     return [job.record for job in jobs if job.record is not None]
 
 
-def _finished_tiles(tiles: Iterable[TileJob]) -> list[TileJob]:
-    """Return the tiles that this run has done."""
-    return [job for job in tiles if job.state == "done"]
-
-
 def summarize(
     tiles: list[TileJob], squares: list[TileJob], cpu_seconds: float, seconds: float
 ) -> JsonObject:
     """Return the figures of all tiles and squares of rounds, for :attr:`TiledRun.summary`."""
-    worked = _records_of(_finished_tiles(tiles))
+    worked = _records_of(job for job in tiles if job.state == "done")
     classes: Counter[str] = Counter()
     point_counts: Counter[str] = Counter()
     for record in _records_of(tiles):
@@ -225,7 +221,7 @@ def summarize(
     return {
         "points": points,
         "points_read": sum(record.read for record in worked),
-        "dropped": sum(record.dropped for record in worked),
+        "dropped": sum(record.dropped for record in _records_of(tiles)),
         "seconds": seconds,
         "points_per_second": points / seconds if seconds else 0.0,
         "cpu_seconds": cpu_seconds,
@@ -243,19 +239,17 @@ def messages_of(
 ) -> list[str]:
     """Return the messages about inputs, then those of tiles and of squares of the rounds before.
 
-    These come once each, frequent ones first. That nothing matches is told where it holds for a
-    whole round, whatever an earlier run did of it.
+    These come once each, frequent ones first, whether this run or an earlier one did the tiles.
+    That nothing matches is told where it holds for a whole round.
     """
-    done = _records_of(_finished_tiles(tiles))
     counts: Counter[Message] = Counter()
     for jobs in (tiles, *rounds):
-        every = [set(record.messages) for record in _records_of(jobs) if record.points]
-        new = [record for record in _records_of(_finished_tiles(jobs)) if record.points]
-        lines = (each for record in new for each in dict.fromkeys(record.messages))
+        records = [record for record in _records_of(jobs) if record.points]
+        lines = (each for record in records for each in dict.fromkeys(record.messages))
         for message, n in Counter(lines).items():
             if message.topic is not Topic.NOTHING_MATCHES:
                 counts[message] += n
-            elif all(message in messages for messages in every):
+            elif n == len(records):
                 counts[message] = max(counts[message], n)
     shown = Counter({message: counts[message] for message in drop_repeated(counts)})
     if any(each.topic is Topic.NO_REFERENCE for each in inputs):  # it tells what is assumed
@@ -265,14 +259,14 @@ def messages_of(
     messages += [f"{m} ({count_of(n, 'tile')})" for m, n in shown.most_common(_MOST_MESSAGES)]
     if len(shown) > _MOST_MESSAGES:
         messages.append(f"and {len(shown) - _MOST_MESSAGES} more; see --report")
-    if short := [job.name for job in [*_finished_tiles(tiles), *chain(*rounds)] if job.is_short]:
+    if short := [job.name for job in [*tiles, *chain(*rounds)] if job.is_short]:
         messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
             "or terrain reach farther "
             f"than could be read within {most_points:,} points; they may differ from an untiled "
             "run: " + ", ".join(short[:5])
         )
-    return messages + _shared_points(done)
+    return messages + _shared_points(_records_of(tiles))
 
 
 def _shared_points(tiles: Sequence[TileRecord]) -> list[str]:
@@ -353,9 +347,12 @@ class Store:
         return str(self.kept / f"{name}{ARRAYS}")
 
     def finish(self, name: str, content: JsonObject, digest: str = "") -> None:
-        """Save what a job that is done tells of itself, and the digest of all that affects it."""
-        partial = self.kept / f"{name}.partial"
-        partial.write_text(json.dumps({**content, "fingerprint": digest}))
+        """Save what a job that is done tells of itself, and the digest of all that affects it.
+
+        A check of all this tells later whether it is what was saved.
+        """
+        partial, record = self.kept / f"{name}.partial", {**content, "fingerprint": digest}
+        partial.write_text(json.dumps({**record, "check": fingerprint(record)}))
         os.replace(partial, self._note(name))
 
     def forget(self, name: str) -> None:
@@ -363,12 +360,10 @@ class Store:
         self._note(name).unlink(missing_ok=True)
 
     def note(self, name: str) -> JsonObject:
-        """Return the record of a finished job with its fingerprint; empty without one."""
-        try:
-            record = strict_json(self._note(name).read_bytes())
-            return record if isinstance(record, dict) else {}
-        except (OSError, ValueError, RecursionError):
-            return {}
+        """Return the record of a finished job as it was saved; empty where it is not that."""
+        record = self._saved(name)
+        check = record.pop("check", None)
+        return record if check == fingerprint(record) else {}
 
     def grids(self) -> RunGrids | None:
         """Return the grids of the run before; None where it is not known."""
@@ -376,12 +371,16 @@ class Store:
             return RunGrids.from_json(self.note("run"))
         return None
 
+    def record(self, name: str, digest: str) -> JsonObject | None:
+        """Return the record of a job if `digest` matches, whatever became of its files."""
+        record = self.note(name)
+        return record if record.get("fingerprint") == digest else None
+
     def finished(self, name: str, digest: str) -> JsonObject | None:
         """Return the record of a job if `digest` matches and the files it wrote are unchanged."""
-        record = self.note(name)
-        with contextlib.suppress(OSError, ValueError, TypeError):  # whatever is written there
-            unchanged = all(file.is_unchanged for file in written_files(record))
-            if record.get("fingerprint") == digest and unchanged:
+        record = self.record(name, digest)
+        with contextlib.suppress(OSError):  # a file is gone
+            if record and all(file.is_unchanged for file in written_files(record)):
                 return record
         return None
 
@@ -389,7 +388,7 @@ class Store:
         """Return the outputs of a finished job that were changed since it wrote them."""
         paths = []
         with contextlib.suppress(TypeError):
-            for file in written_files(self.note(name)):
+            for file in written_files(self._saved(name)):
                 with contextlib.suppress(OSError, ValueError, TypeError):
                     if file.digest and not file.is_unchanged:
                         paths.append(str(file.path))
@@ -400,9 +399,17 @@ class Store:
         paths: set[str] = set()
         for note in self.kept.glob("*.json"):
             with contextlib.suppress(TypeError):
-                files = written_files(self.note(note.stem))
+                files = written_files(self._saved(note.stem))
                 paths.update(str(file.path) for file in files if file.digest)
         return sorted(path for path in paths - {*outputs} if os.path.exists(path))
+
+    def _saved(self, name: str) -> JsonObject:
+        """Return what is saved of a job, by any version and damaged or not; empty for no object."""
+        try:
+            record = strict_json(self._note(name).read_bytes())
+            return record if isinstance(record, dict) else {}
+        except (OSError, ValueError, RecursionError):
+            return {}
 
     def _note(self, name: str) -> Path:
         return self.kept / f"{name}.json"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
@@ -48,18 +48,28 @@ class PlanRun(SurveyRun):
             "peak_mb_of_a_worker": self.peak_mb,
         }
         most = survey.options.most_points
-        messages = messages_of(self.tiles, self.squares, survey.messages, most)
+        inputs = [*survey.messages, *survey.warnings_of_boxes()]
+        messages = messages_of(self.tiles, self.squares, inputs, most)
         changed = survey.changed()
         return TiledRun(self.tiles, self.outputs, survey.faults, changed, messages, summary)
 
     # ---- tiles and outputs -----------------------------------------------------------------------
 
-    def inputs_of_waiting(self) -> set[str]:
-        """Return the inputs whose points waiting tiles and their rounds read."""
+    def square_of(self, job: TileJob) -> tuple[int, int]:
+        """Return the square that a tile lies in."""
+        factor = self.survey.tiles_per_square
+        return job.tile[0] // factor, job.tile[1] // factor
+
+    def inputs_of_waiting(self, squares: Collection[tuple[int, int]]) -> set[str]:
+        """Return the inputs whose points waiting tiles, some squares and their rounds read."""
         far = len(self.plan.rounds) * (self.farthest + self.survey.squares.size)
         if blocks := self.plan.blocks:
             far += (self.plan.sees_m + blocks.side + blocks.reach) / self.survey.unit
-        waiting = [job.tile for job in self.tiles if job.state == "waiting"]
+        waiting = [
+            job.tile
+            for job in self.tiles
+            if job.state == "waiting" or self.square_of(job) in squares
+        ]
         return {source.path for tile in waiting for source in self.survey.near(tile, far)}
 
     def find_jobs(self) -> None:
@@ -103,9 +113,15 @@ class PlanRun(SurveyRun):
             self.outputs.append(out)
 
     def take_over(self) -> None:
-        """Keep the results of an earlier run; tiles that no output needs are not run again."""
+        """Keep the results of an earlier run.
+
+        Tiles that no output needs run again only where their record is lost, unless what they gave
+        was edited since.
+        """
         needed = {job.name for out in self.unkept(self.outputs) for job in out.needs}
         self.unkept(job for job in self.tiles if job.outputs is not None or job.name in needed)
+        edited_outputs = [out for out in self.outputs if {*self.edited} & {*(out.outputs or ())}]
+        edited = {job.name for out in edited_outputs for job in out.needs}
         jobs: list[WritingJob] = [*self.tiles, *self.outputs]
         outputs = {path for job in jobs for path in job.outputs or ()}
         self.survey.messages += [
@@ -120,8 +136,9 @@ class PlanRun(SurveyRun):
         ]
         for job in self.tiles:
             if job.state == "waiting" and job.outputs is None and job.name not in needed:
-                known = self.store.note(job.name)
-                job.keep(known if known.get("fingerprint") == job.digest else {})
+                known = self.store.record(job.name, job.digest)
+                if known or job.name in edited:
+                    job.keep(known or {})
 
     @cached_property
     def context(self) -> RunContext:

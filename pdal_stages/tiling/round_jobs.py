@@ -44,7 +44,8 @@ class RoundJobs:
                 block.fail_with_needed()
             for _ in self.run.do(f"{label}, blocks", self.run.unkept(blocks), self._block_task):
                 pass
-            self.run.squares.append([*squares, *self._unneeded_squares(number, squares)])
+            every = [*squares, *self._unneeded_squares(number, squares)]
+            self.run.squares.append(sorted(every, key=lambda job: job.tile))
         for job in waiting:
             job.fail_with_needed()
         stop_if_hopeless([job.reason for job in waiting])
@@ -57,21 +58,36 @@ class RoundJobs:
         others = self._points_of_squares.keys() - {job.tile for job in needed}
         jobs = [self._square_job(number, square) for square in sorted(others)]
         for job in jobs:
-            known = self.run.store.note(job.name)
-            job.keep(known if known.get("fingerprint") == job.digest else {})
+            job.keep(self.run.store.record(job.name, job.digest) or {})
         return jobs
+
+    @cached_property
+    def lost(self) -> list[list[tuple[int, int]]]:
+        """The squares of each round before the last that have no record, but whose tiles have one.
+
+        Or will have one: tiles that are kept without a record are in no report.
+        """
+        reported = {
+            self.run.square_of(job)
+            for job in self.run.tiles
+            if job.state == "waiting" or job.record is not None
+        }
+        lost = []
+        for number in range(len(self.run.plan.rounds) - 1):
+            jobs = [self._square_job(number, square) for square in sorted(reported)]
+            lost.append([j.tile for j in jobs if not self.run.store.record(j.name, j.digest)])
+        return lost
 
     @cached_property
     def _points_of_squares(self) -> dict[tuple[int, int], int]:
         """Return the squares that have points, and how many."""
         points: Counter[tuple[int, int]] = Counter()
-        factor = self.run.survey.tiles_per_square
         for job in self.run.tiles:
-            points[job.tile[0] // factor, job.tile[1] // factor] += job.points
+            points[self.run.square_of(job)] += job.points
         return points
 
     def _layer(self, number: int, users: list[TileJob]) -> tuple[list[TileJob], list[BlockJob]]:
-        """Return jobs for the squares of a round, and for blocks, that `users` need.
+        """Return jobs for the squares of a round, and for blocks, that `users` or counts need.
 
         What an earlier run with other inputs left is removed.
         """
@@ -79,7 +95,7 @@ class RoundJobs:
         grid, every, unit = context.grid_of(number + 1), self._points_of_squares, survey.unit
         names = {square: f"{square_name(context, number, square)}.npz" for square in every}
         self.run.store.remove(f".round{number}.npz", names.values())
-        squares: dict[tuple[int, int], TileJob] = {}
+        squares = {place: self._square_job(number, place) for place in self.lost[number]}
         blocks: dict[tuple[int, int], BlockJob] = {}
 
         def squares_in(box: Box) -> list[TileJob]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..base.files import whole_files
 from ..base.grid import begins_run
 from ..base.hashing import digest_of_file
+from ..base.las_check import beyond_box
 from ..base.las_points import Layout, read_records
 from ..terrain.pieces import refuse_scattered
 from .inputs import CloudIndex, InputSource, sum_points
@@ -76,7 +77,8 @@ def sort_points(path: str, grid: TileGrid, lone_grid: TileGrid, target: str) -> 
     refuse_scattered(squares[:, 2].tolist())
     box = (*low.tolist(), *high.tolist())
     places = [(i, j, n) for i, j, n in tiles.tolist()]
-    return CloudIndex(total, box, places, held, cells, digest, changed_ns, squares, target)
+    warning = (beyond_box(path, box) if total else None) or ""
+    return CloudIndex(total, box, places, held, cells, digest, changed_ns, squares, warning, target)
 
 
 def _runs(

@@ -9,11 +9,10 @@ from contextlib import AbstractContextManager
 from functools import partial
 from typing import TypeVar
 
-from ..base import las_check
 from ..base.errors import StageError, WriteError
 from ..base.hashing import fingerprint
-from ..base.messages import Message
 from ..base.progress import Progress
+from ..base.version import build
 from ..pipeline.workers import Task, ThisProcess, WorkerProcesses, Workers, run_tasks
 from .inputs import CloudIndex, Survey
 from .jobs import InputJob, Job, OutputJob, Store
@@ -92,14 +91,13 @@ class SurveyRun:
             if source.index and (source.index.copy or source.path not in needed):
                 continue
             name = fingerprint(source.path, vars(survey.grid))
-            # Without a valid record it is read again.
-            with contextlib.suppress(ValueError, TypeError, KeyError, OverflowError):
-                index = CloudIndex.from_json(store.note(name))
-                if source.path not in needed and index.is_of(source.path):
+            if source.path not in needed and (saved := store.record(name, build())):
+                index = CloudIndex.from_json(saved)
+                if index.is_of(source.path):
                     source.index = index
                     continue
             assert source.extent is not None
-            waiting.append(InputJob(name, source.extent.count, source=source))
+            waiting.append(InputJob(name, source.extent.count, digest=build(), source=source))
 
         def task_of(job: InputJob) -> Task:
             copy = str(store.scratch / f"{job.name}.points")
@@ -110,9 +108,6 @@ class SurveyRun:
                 raise StageError(job.reason)
             job.source.blame(job.reason)
             job.source.index = job.record or job.source.index
-            if job.record is not None and job.record.count:
-                odd = las_check.beyond_box(job.source.path, job.record.box)
-                survey.messages += [Message(odd)] if odd else []
         survey.place()
 
     def unkept(self, jobs: Iterable[_Job]) -> deque[_Job]:

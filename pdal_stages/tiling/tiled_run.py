@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -108,12 +109,13 @@ def run_plan(
                 run = PlanRun(plan, survey, store, workers, progress)
                 run.read_inputs()
                 run.find_jobs()
+                rounds = RoundJobs(run)
                 if chosen.resume:
                     run.take_over()
-                    run.read_inputs(run.inputs_of_waiting())
+                    run.read_inputs(run.inputs_of_waiting({*chain(*rounds.lost)}))
                 interrupted = True
                 with contextlib.suppress(KeyboardInterrupt):
-                    RoundJobs(run).make()
+                    rounds.make()
                     run.make_outputs(finished)
                     run.forget()
                     interrupted = False
