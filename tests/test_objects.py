@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from scipy.sparse.csgraph import connected_components
 
 import pdal_stages as ps
 from pdal_stages import Cells, ObjectSettings, find_objects
 from pdal_stages.base.errors import StageError
 from pdal_stages.objects.cells import Kind, object_id
 from pdal_stages.objects.crowns import crown_cells
+from pdal_stages.objects.spans import GAP, join_near, number_spans
 
 
 def house(x0, y0, x1, y1, z, step=0.3, code=6):
@@ -146,6 +150,36 @@ def test_wires_that_cross_far_apart_in_height_are_two_spans_and_close_ones_one()
         wires = np.concatenate([one, np.column_stack([level + 30, along, level + above])])
         codes = np.full(len(wires), 14, np.uint8)
         assert len(found_in(*scene((wires, codes), size=60.0)).tables[Kind.SPAN]) == spans
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_cubes_are_joined_as_all_pairs_join_them(seed):
+    rng = np.random.default_rng(seed)
+    size = rng.choice([0.1, 0.25, 0.4, 0.5, 1.0, 4.0])
+    extent, count = rng.choice([2.0, 10.0, 40.0], 3), rng.integers(1, 400)
+    xyz = rng.uniform(0, 1, (count, 3)) * extent + (500_000, -30, 20)
+    xyz[::3, 2] = np.round(xyz[::3, 2])
+    cubes = Cells.from_points(*xyz.T, np.full(count, 14, np.uint8), size).wires
+    label = np.arange(len(cubes.place))
+    join_near(cubes.place[:, :2], cubes.middles() / GAP, GAP / size, label)
+    apart = cubes.middles()[:, None] - cubes.middles()
+    near = (apart**2).sum(axis=2) <= GAP**2
+    assert np.array_equal(label, connected_components(near)[1])
+    join_near(cubes.place[:, :2], cubes.place[:, 2:], 2.0**0.5, label)
+    near |= np.abs(cubes.place[:, None] - cubes.place).max(axis=2) <= 1
+    assert np.array_equal(label, connected_components(near)[1])
+
+
+def test_false_wires_that_fill_a_volume_take_little_memory():
+    """Each of 83,200 cubes has some 250 others within the gap: 2,000 bytes as pairs."""
+    middle = np.stack(np.mgrid[:80, :80, :13], axis=-1).reshape(-1, 3) * 0.5 + 0.25
+    cubes = Cells.from_points(*middle.T, np.full(len(middle), 14, np.uint8), 0.5).wires
+    tracemalloc.start()
+    number = number_spans(cubes)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(number) == len(middle) and not number.any()
+    assert peak < 500 * len(middle)
 
 
 def test_a_building_larger_than_any_block_and_its_margin():
