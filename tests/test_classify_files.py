@@ -68,6 +68,26 @@ def test_an_output_for_each_input(folder, classify, tmp_path, given, output, wor
         assert len(written) == 500 and set(np.unique(written)) == {2, 6}
 
 
+@pytest.mark.parametrize("output", ["out.laz", "out.txt", "out/"])
+def test_points_are_counted_where_pdal_writes_them(folder, classify, tmp_path, output):
+    options = ["--writers.las.scale_x=0.05"] if output != "out.txt" else []
+    code, out, err = classify(folder / "in" / "t1.laz", f"{tmp_path}/{output}", *options)
+    assert code == 0 and "500 points" in out, out + err
+
+
+@pytest.mark.parametrize("words", [(), ("--per", "tile"), ("--dry-run",)])
+def test_a_dimension_that_cannot_be_written_is_refused_before_any_tile(
+    folder, classify, tmp_path, words
+):
+    las = laspy.read(folder / "in" / "t1.laz")
+    las.add_extra_dim(laspy.ExtraBytesParams("Reliability", "u1"))
+    (tmp_path / "in").mkdir()
+    las.write(tmp_path / "in" / "odd.laz")
+    code, out, err = classify(tmp_path / "in", tmp_path / "out/", "--tile", 20, *words)
+    assert code == 1 and "odd.laz: the input has a dimension 'Reliability'" in err, err
+    assert not out and not (tmp_path / "out").exists()
+
+
 def test_several_inputs_are_not_merged_into_one(folder, classify, tmp_path):
     code, _, err = classify(folder / "in", tmp_path / "all.laz")
     assert code == 1 and "#" in err and not list(tmp_path.iterdir())

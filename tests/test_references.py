@@ -365,3 +365,16 @@ def test_feet_up_that_are_taken_for_meters_are_doubted(tmp_path, run, write_las)
         code, _, err = run("classify", source, tmp_path / "out.las", *words)
         assert code == 0 and ("the unit of z may be wrong" in err) == doubted, err
         assert (np.asarray(laspy.read(tmp_path / "out.las").classification) == 5).sum() > 5000
+
+
+@pytest.mark.parametrize("tile", [(), ("--tile", "50", "--workers", "0")])
+@pytest.mark.parametrize("option", ["override_srs", "default_srs"])
+def test_a_reference_system_that_nobody_knows_is_refused(tmp_path, write_las, capsys, option, tile):
+    """The option is at fault, not the input."""
+    arrays = {axis: np.arange(50.0) for axis in "XYZ"}
+    path = write_las(tmp_path / "a.las", arrays)
+    words = [str(path), str(tmp_path / "out.las"), f"--readers.las.{option}=EPSG:1", *tile]
+    assert main(["classify", *words, "--no-progress"]) == 1
+    said = capsys.readouterr().err
+    assert "reference system" in said and "Give a code, EPSG:CODE" in said, said
+    assert "failed" not in said and "EPSG:1'" in said, said

@@ -316,6 +316,22 @@ def test_sparse_points_widen_the_surroundings(tmp_path, random_cloud, write_las,
         assert any(job.record.short for job in run.tiles)
 
 
+def test_a_stray_point_far_away_is_read_with_all_others(tmp_path, random_cloud, write_las):
+    """However often its tile would have to be widened by its own size."""
+    xyz = random_cloud(300, seed=1, extent=(40, 40, 4))
+    xyz[7, 0] += 30_000
+    path = write_las(tmp_path / "stray.las", dict(zip("XYZ", xyz.T, strict=True)))
+    stages = [str(path), _features("k8", "covariance")]
+    writer = {"type": "writers.las", "forward": "all", "extra_dims": "all"}
+    whole, tiles = (
+        [*stages, {**writer, "filename": str(tmp_path / name)}] for name in ("a.las", "b.las")
+    )
+    ps.Pipeline(whole).execute(arrays=False)
+    run = run_tiled(tiles, 20, workers=0)
+    assert not run.failures and not any("may differ" in note for note in run.messages)
+    clouds.same_points(tmp_path / "a.las", tmp_path / "b.las")
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.002, 0.1))
 def test_terrain_within_its_reach_is_the_whole_terrain(seed, density):

@@ -168,7 +168,7 @@ def print_run(run: TiledRun) -> None:
         parts.append(f"{count_of(files['done'], 'file')} written{_other_states(files)}")
     parts.append(f"{count_of(s['states']['done'], 'tile')} done{_other_states(s['states'])}")
     speed = f"{s['points_per_second']:,.0f} points/s"
-    parts.append(f"{s['points']:,} points in {s['seconds']:.1f} s ({speed})")
+    parts.append(f"{count_of(s['points'], 'point')} in {s['seconds']:.1f} s ({speed})")
     print("; ".join(parts))
     if s["dropped"]:
         print(f"{s['dropped']:,} points were dropped by filters of the pipeline")
@@ -209,11 +209,15 @@ def _other_states(states: Mapping[str, int]) -> str:
 
 
 def _print_failures(run: TiledRun) -> None:
-    """Print the first failures."""
-    failures = run.failures
-    print_messages(*(f"{what}: {reason}" for what, reason in failures[:_MOST_FAILURES]))
-    if len(failures) > _MOST_FAILURES:
-        print_messages(f"and {len(failures) - _MOST_FAILURES:,} more; see --report")
+    """Print the first reasons of failures, each with the first that failed for it."""
+    failed: dict[str, list[str]] = {}
+    for what, reason in run.failures:
+        failed.setdefault(reason, []).append(what)
+    for reason, names in [*failed.items()][:_MOST_FAILURES]:
+        more = f" and {len(names) - 1:,} more" if len(names) > 1 else ""
+        print_messages(f"{names[0]}{more}: {reason}")
+    if len(failed) > _MOST_FAILURES:
+        print_messages(f"and {len(failed) - _MOST_FAILURES:,} more reasons; see --report")
 
 
 def end_run(files: Sequence[Output], run: TiledRun, again: str) -> int:

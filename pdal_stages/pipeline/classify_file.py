@@ -84,7 +84,8 @@ def _copy(
     messages += pipeline.messages
     del seen, columns, known
     if not pipeline.copied:
-        return copy.count, [*messages, *_write_through_pdal(copy, values, writer)]
+        messages += _write_through_pdal(copy, values, writer)
+        return copy.count, messages
 
     def check(partial: Path, final: Path, number: int) -> None:
         check_complete(partial, final, writer, copy.count)

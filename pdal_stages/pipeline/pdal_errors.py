@@ -14,6 +14,8 @@ _DRIVER_CURE = (
     "libpdal_plugin_filter_python"
 )
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
+#: The command where no file is PDAL's.
+COPIES = "pdal-stages classify (LAS to LAS, an output for each input)"
 FLAGS_IN_CLASSES = (
     "this PDAL reads the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 as parts of the "
     "class, and would make other classes of them here"
@@ -28,6 +30,7 @@ REFERENCE_CURE = (
     "Name the right one, --readers.las.override_srs=EPSG:CODE "
     '(in a pipeline "override_srs" of the reader)'
 )
+NAME_CURE = "Give a code, EPSG:CODE or EPSG:CODE+CODE with that of the heights, or well-known text"
 
 
 def translate(message: str, before: Sequence[str] = ()) -> PipelineError | DependencyError:
@@ -52,8 +55,11 @@ def translate(message: str, before: Sequence[str] = ()) -> PipelineError | Depen
         return PipelineError(what, found=one_line, cure=CURE_OF_DAMAGE)
     if "convert spatial reference" in text:
         return PipelineError(BROKEN_REFERENCE, found=one_line, cure=REFERENCE_CURE)
+    if "Could not import coordinate system" in text:
+        what = "PDAL knows no reference system of this name"
+        return PipelineError(what, found=one_line, cure=NAME_CURE)
     if "dimension with invalid name" in text:
-        cure = "Run it with pdal-stages classify, which takes names as they are"
+        cure = f"Run it with {COPIES}, which takes names as they are"
         return PipelineError("PDAL refuses the name of a dimension", found=one_line, cure=cure)
     if "Traceback (most recent call last)" in text:  # of a script; a list in older PDAL
         lines = [line.strip(" '") for line in text.replace("\\n", "\n").splitlines()]

@@ -36,7 +36,7 @@ from ..stages.points import CodeLimit
 from ..stages.registry import stage_types
 from . import pdal as pdal_env
 from .inputs_outputs import is_writer, readers_files, writes_las
-from .pdal_errors import FLAGS_CURE, FLAGS_IN_CLASSES
+from .pdal_errors import COPIES, FLAGS_CURE, FLAGS_IN_CLASSES
 from .runtime import ExpandedStage
 from .spatial_reference import MOVING, projection_records, reference_of
 
@@ -45,12 +45,11 @@ _AS_LAS_14 = '"minor_version": 4 and "dataformat_id": 6 (7 with colors, 8 with n
 
 def _unread_keys(path: str, header: LasHeader) -> str:
     numbers = [number for number, data in projection_records(path) if len(data) >= 8]
-    return f"{path}, LAS 1.{header.minor}" if header.minor >= 4 and 34735 in numbers else ""
+    return f"LAS 1.{header.minor}" if header.minor >= 4 and 34735 in numbers else ""
 
 
 def _waveforms(path: str, header: LasHeader) -> str:
-    seen = f"{path}, point format {header.point_format}"
-    return seen if header.point_format in WAVES else ""
+    return f"point format {header.point_format}" if header.point_format in WAVES else ""
 
 
 def _overwritten(path: str, header: LasHeader) -> str:
@@ -99,22 +98,20 @@ FACTS = (
     Fact(
         "PDAL takes the name of this file for a pattern, and reads others",
         lambda path, _: path if glob.has_magic(path) else "",
-        "Rename it, or run it with pdal-stages classify, which takes names as they are",
+        f"Rename it, or run it with {COPIES}, which takes names as they are",
     ),
     Fact(
         "PDAL does not read points with waveforms",
-        lambda path, at: (
-            f"{path}, point format {at.point_format}" if at.point_format in WAVES else ""
-        ),
+        _waveforms,
         "Convert the file to the format without them: laspy.convert(laspy.read(IN), "
         "point_format_id=N).write(OUT) with N 1 for 4, 3 for 5, 6 for 9, 8 for 10; or run it with "
-        "pdal-stages classify, which keeps them",
+        f"{COPIES}, which keeps them",
     ),
     Fact(
         "this PDAL reads no spatial reference of LAS 1.4 with GeoTIFF keys",
         _unread_keys,
         'Name it: "default_srs": "EPSG:CODE" of the reader (--readers.las.default_srs); or run it '
-        "with pdal-stages classify, which reads them",
+        f"with {COPIES}, which reads them",
         until=(2, 4, 0),
         unless=("override_srs", "default_srs", "spatialreference"),
     ),
@@ -122,21 +119,21 @@ FACTS = (
         "extra bytes are named like dimensions of LAS, so PDAL would overwrite these",
         _overwritten,
         'Read them under other names: readers.las with "ignore_vlr": "LASF_Spec/4" and '
-        '"extra_dims": "Name=type,..."; or run it with pdal-stages classify, which keeps both',
+        f'"extra_dims": "Name=type,..."; or run it with {COPIES}, which keeps both',
         unless=_NAMES_EXTRA,
     ),
     Fact(
         "PDAL leaves out extra bytes that the first record of their descriptions does not name",
         _undescribed,
         'Name them: "extra_dims": "Name=type,..." of the reader, or leave "extra_dims" of the '
-        "writer out to drop all; or run it with pdal-stages classify, which keeps them",
+        f"writer out to drop all; or run it with {COPIES}, which keeps them",
         unless=_NAMES_EXTRA,
         matters=_writes_extra,
     ),
     Fact(
         "filters.python, in which the stages run, takes only texts in UTF-8 from a LAS file",
         _odd_text,
-        "Write the file anew without it, or run it with pdal-stages classify, which keeps it",
+        f"Write the file anew without it, or run it with {COPIES}, which keeps it",
         matters=_runs_python,
     ),
 )

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ..base.errors import PipelineError, StageError
+from ..base.errors import OptionError, PipelineError, StageError
 from ..base.json_types import JsonObject, StageJson
 from ..base.las import (
     PROJECTION,
@@ -33,7 +33,7 @@ from ..base.units import (
 )
 from . import pdal as pdal_env
 from .inputs_outputs import LAS_READERS, readers_files
-from .pdal_errors import BROKEN_REFERENCE, REFERENCE_CURE
+from .pdal_errors import BROKEN_REFERENCE, NAME_CURE, REFERENCE_CURE
 from .runtime import reader_metadata, wkt_of
 
 #: Stages that may bring points into one reference.
@@ -184,8 +184,14 @@ def text_of(reader: StageJson) -> tuple[str, str]:
         return _wkt_and_plane(reader_metadata(run.metadata).get("srs", {}))[0], ""
     check_readable(path)  # PDAL, which may be asked for another file, crashes of damaged ones
     wkt, note = ("", "") if reader.get("override_srs") else reference_of_las(path)
-    named = reader.get("override_srs") or (not wkt and reader.get("default_srs"))
-    return (described(str(named))[0] if named else wkt), note
+    option = "override_srs" if reader.get("override_srs") else "default_srs"
+    if wkt or not reader.get(option):
+        return wkt, note
+    try:
+        return described(str(reader[option]))[0], note
+    except PipelineError as error:
+        what = f"option '{option}' names no reference system that PDAL knows"
+        raise OptionError(what, where=reader["type"], found=error.found, cure=NAME_CURE) from None
 
 
 def reference_of(reader: StageJson, horizontal: str = "", vertical: str = "") -> Reference:

@@ -176,7 +176,8 @@ class HagMorphological(FarReaching, settings=FilterOptions):
             raise NoTerrainError(
                 "no ground is given: none of the points has class 2, 9 or 11",
                 found=f"{points.count:,} points",
-                cure="Classify the ground first, or leave 'given_ground' out: ground is then found",
+                cure="Classify the ground first, or let it be found: without 'given_ground' "
+                "(classify: --ground found)",
             )
         observer = context.observer
         keep = self._write_rasters(points) if observer is None else observer.see_raster

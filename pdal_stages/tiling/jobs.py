@@ -262,9 +262,8 @@ def messages_of(
     if short := [job.name for job in [*tiles, *chain(*rounds)] if job.is_short]:
         messages.append(
             f"{len(short)} tile{'s have' if len(short) > 1 else ' has'} points whose neighborhoods "
-            "or terrain reach farther "
-            f"than could be read within {most_points:,} points; they may differ from an untiled "
-            "run: " + ", ".join(short[:5])
+            f"or terrain reach farther than the next files, or {most_points:,} points; they may "
+            "differ from an untiled run: " + ", ".join(short[:5])
         )
     return messages + _shared_points(_records_of(tiles))
 

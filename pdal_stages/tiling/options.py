@@ -321,7 +321,7 @@ def choose_tiles(
     least = needed(sides[0]) * max(1, local if fixed else 1) + (PARENT if local else 0)
     raise OptionError(
         "there is not enough memory for tiles" + ("" if options.tile is None else " of this size"),
-        found=f"{whole / 1e9:.1f} GB; about {least / 1e9:.1f} GB are needed",
+        found=f"{whole / 1e6:,.0f} MB; about {least / 1e6:,.0f} MB are needed",
         cure="Give more with --memory, or fewer --workers"
         + (", or a smaller --tile" if options.tile else ""),
     )

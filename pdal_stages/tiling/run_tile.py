@@ -59,9 +59,8 @@ from .records import SharedPoints, TileRecord, WrittenFile, describe_written
 from .sorted_points import Piece, cut_all
 from .write_outputs import PieceResults, arrays_of, write_tile
 
-#: How many times a tile is read again with a wider halo (not tuned); one that needs more is
-#: reported as ``short``.
-_MOST_WIDENINGS = 3
+#: How many times a tile is read again with a wider halo (not tuned); the last time with all points.
+_MOST_WIDENINGS = 4
 #: Dimensions that say where a point of a tile comes from.
 _ORIGIN = (ROW, INPUT, OUTSIDE)
 
@@ -323,7 +322,7 @@ class _TileHalo:
     tile: tuple[int, int]
     complete_m: float  #: within which all inputs are known
     used_m: float
-    short: bool = False  #: more is needed, and too much to read
+    short: bool = False  #: more is needed, and too much to read, or in inputs too far away
     attempts: int = 0
 
     @property
@@ -337,15 +336,25 @@ class _TileHalo:
         """Return the side of the tile in meters."""
         return self.context.grid_of(self.number).size * self.context.unit
 
+    @property
+    def everything_m(self) -> float:
+        """Return the halo in meters with which all points are read."""
+        tile, bounds = self.context.grid_of(self.number).box(self.tile), self.context.bounds
+        low = max(tile[axis] - bounds[axis] for axis in (0, 1))
+        high = max(bounds[axis] - tile[axis] for axis in (2, 3))
+        return max(low, high) * self.context.unit
+
     def widen(self, needed_m: float, read: int) -> bool:
         """Widen it to what stages need, `read` points so far; False where it stays as it is."""
         if self.complete or needed_m <= self.used_m:
             return False
         if math.isinf(needed_m):  # there are too few points
             needed_m = self.used_m + 2 * self.side_m
+        if self.attempts + 1 == _MOST_WIDENINGS:
+            needed_m = max(needed_m, self.everything_m)
         wider = (self.side_m + 2 * needed_m) / (self.side_m + 2 * self.used_m)
         too_many = read * wider**2 > self.context.most_points
-        self.short = too_many or needed_m > self.complete_m or self.attempts == _MOST_WIDENINGS
+        self.short = too_many or needed_m > self.complete_m
         if not self.short:
             self.used_m, self.attempts = needed_m + 1e-6, self.attempts + 1
         return not self.short

@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import DependencyError
+from ..base.errors import DependencyError, StageError
 from ..base.files import create_folder, sweep
 from ..base.jit import count_cached_kernels
 from ..base.json_types import StageJson
@@ -26,6 +26,7 @@ from .plan import TilePlan, make_plan
 from .plan_run import PlanRun
 from .round_jobs import RoundJobs
 from .survey_run import workers_of
+from .write_outputs import copy_in
 
 
 def run_tiled(
@@ -92,6 +93,7 @@ def run_plan(
     plan = replace(plan, copied=plan.copied and chosen.per == "file")
     if not plan.copied:
         _refuse_misread(plan, survey, chosen.per == "tile")
+    _refuse_uncopied(plan, survey)
     if pipeline is not None and not plan.copied:
         _try_on_an_input(pipeline, survey, len(plan.readers))
     if dry_run:
@@ -134,6 +136,16 @@ def _refuse_misread(plan: TilePlan, survey: Survey, together: bool) -> None:
     for stages in [readers] if together else [[reader] for reader in readers]:
         for check in (check_inputs, check_units, check_flags):
             check([*stages, *plan.per_output])
+
+
+def _refuse_uncopied(plan: TilePlan, survey: Survey) -> None:
+    """Refuse inputs of which no copy can be written with what stages create."""
+    for source in survey.readable():
+        try:
+            layout = source.layout
+        except StageError:
+            continue  # which reading it reports
+        copy_in(plan, source, layout, ".las", {})
 
 
 def _try_on_an_input(pipeline: Pipeline, survey: Survey, readers: int) -> None:

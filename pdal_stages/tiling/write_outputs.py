@@ -165,8 +165,8 @@ def run_tail(
     return OutputRecord(describe_written(outputs), run.count, classes)
 
 
-def _copy(
-    source: InputSource, layout: Layout, plan: TilePlan, target: str, types: Mapping[str, np.dtype]
+def copy_in(
+    plan: TilePlan, source: InputSource, layout: Layout, target: str, types: Mapping[str, np.dtype]
 ) -> LasCopy:
     """Return a copy of an input with the dimensions of a plan; `types` are those of new values."""
     added = dict(plan.makes if plan.extra_dims is None else plan.extra_dims)
@@ -198,7 +198,7 @@ def write_file(
                 at += len(records)
 
     types = result_types(results, source)
-    copy = _copy(source, layout, plan, outputs[0] if plan.copied else ".las", types)
+    copy = copy_in(plan, source, layout, outputs[0] if plan.copied else ".las", types)
     return run_tail([(source, copy, parts())], plan, outputs, scratch)
 
 
@@ -210,6 +210,6 @@ def write_tile(
     for piece, rows, values in ((r.piece, r.rows, r.values) for r in results):
         if piece.own_rows.size:  # only the tile's own points remain
             types = {name: column.dtype for name, column in values.items()}
-            copy = _copy(piece.source, piece.layout, plan, ".las", types)
+            copy = copy_in(plan, piece.source, piece.layout, ".las", types)
             copies.append((piece.source, copy, [(piece.records[rows], values)]))
     return run_tail(copies, plan, outputs, scratch) if copies else OutputRecord([])
