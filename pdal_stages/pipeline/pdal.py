@@ -181,7 +181,25 @@ def execute(
 #: in two threads is the other's log. It also holds Python still, so runs in threads gain nothing
 #: from each other.
 _one_run = threading.RLock()
+#: A reader of one point, without a file.
+ONE_POINT: StageJson = {
+    "type": "readers.faux",
+    "mode": "constant",
+    "count": 1,
+    "bounds": "([1, 2], [1, 2], [1, 2])",
+}
 _FAILED_WRITER = re.compile(r"(writers\.\w+) Error\) (GDAL failure (?!\(\d+\) PROJ:).*)")
+
+
+@cache
+def _lasting_pipeline() -> Any:
+    """Return a pipeline that lives as long as the program.
+
+    When PDAL runs a pipeline it lets GDAL report errors to the log of that one, also when it is
+    gone: the next error, as of a reference system that PROJ does not know, crashes. Running this
+    one gives GDAL a log that stays.
+    """
+    return bindings().Pipeline(json.dumps([ONE_POINT]))
 
 
 @runs_pdal
@@ -189,6 +207,7 @@ def _execute(stages: list[StageJson], arrays: bool, loglevel: int) -> Execution:
     pdal = bindings()
     stdout = sys.stdout
     pipeline = None
+    _lasting_pipeline().execute()  # after pipelines that others ran
     try:
         pipeline = pdal.Pipeline(json.dumps(for_this_version(stages)), loglevel=loglevel)
         count = pipeline.execute()
@@ -199,6 +218,7 @@ def _execute(stages: list[StageJson], arrays: bool, loglevel: int) -> Execution:
     finally:
         # A stage that raises leaves sys.stdout pointing into PDAL's log.
         sys.stdout = stdout
+        _lasting_pipeline().execute()
     log = _log(pipeline)
     if failure := _FAILED_WRITER.search(log):  # after which PDAL goes on
         reason = ": ".join(failure.groups())

@@ -76,12 +76,8 @@ def described(reference: str) -> tuple[str, frozenset[str]]:
 
     `reference` is well-known text or a name such as ``EPSG:25832+5783``.
     """
-    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": _POINT}
-    run = pdal_env.execute([{**point, "override_srs": reference}], arrays=False)
+    run = pdal_env.execute([{**pdal_env.ONE_POINT, "override_srs": reference}], arrays=False)
     return _wkt_and_plane(reader_metadata(run.metadata).get("srs", {}))
-
-
-_POINT = "([1, 2], [1, 2], [1, 2])"
 
 
 def _wkt_and_plane(srs: JsonObject) -> tuple[str, frozenset[str]]:

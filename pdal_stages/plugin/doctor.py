@@ -108,12 +108,10 @@ def _run_program(stages: list) -> None:
 
 def _python_of(what: str, run: Callable[[list], object]) -> Finding:
     """Return which Python PDAL runs, and whether it has our package."""
-    bounds = "([1, 2], [1, 2], [1, 2])"
-    point = {"type": "readers.faux", "mode": "constant", "count": 1, "bounds": bounds}
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer")
         name = "pdal_stages_doctor"
-        run([point, runtime.python_filter(name, _SCRIPT, {"answer": str(answer)}, {})])
+        run([pdal_env.ONE_POINT, runtime.python_filter(name, _SCRIPT, {"answer": str(answer)}, {})])
         if not answer.is_file():
             cure = "Install pdal-plugins again, for this PDAL and this Python"
             return Finding(what, "the script did not run", cure)

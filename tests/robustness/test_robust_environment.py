@@ -233,6 +233,26 @@ def test_signals(command, tmp_path, name, ours):
     assert not list(tmp_path.glob(partial))
 
 
+_SYSTEMS = """
+import gc, sys
+import pdal_stages as ps
+from pdal_stages.pipeline.spatial_reference import described, fault_of_reference
+for number in range(20):
+    ps.run_pipeline([sys.argv[1], {"type": "writers.las", "filename": sys.argv[2]}])
+    gc.collect()
+    others = [bytes([255]) * size for size in range(100, 3000, 7)]
+    for function in (described, fault_of_reference):
+        function.cache_clear()
+    fault_of_reference("EPSG:1")
+"""
+
+
+def test_gdal_reports_errors_after_pipelines_are_gone(tmp_path, cloud):
+    """PDAL lets it write to the log of the last one: two cells of a notebook that end Python."""
+    words = [sys.executable, "-c", _SYSTEMS, str(cloud), str(tmp_path / "o.las")]
+    assert subprocess.run(words).returncode == 0
+
+
 def test_a_closed_pipe(command):
     done = command.process(
         command=["sh", "-c", f"{sys.executable} -m pdal_stages.cli drivers | head -1"]
