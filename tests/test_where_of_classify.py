@@ -57,6 +57,18 @@ def test_decks_of_points_that_the_model_gives_another_class(tmp_path, run, write
     assert np.array_equal(codes_values[~left_out], every[~left_out])  # they are still neighbors
 
 
+def test_resume_with_another_condition_keeps_nothing(tmp_path, run, write_las):
+    xyz, _ = scan(SCENES["overpass"](), 1.0)
+    source = write(write_las, tmp_path / "in.las", xyz, 6)
+    x = 500_000 + np.ptp(xyz[:, 0]) / 2
+    for condition in (f"X < {x}", f"X >= {x}"):
+        for name, more in (("resumed.las", ["--resume"]), ("fresh.las", [])):
+            (tmp_path / "fresh.las").unlink(missing_ok=True)
+            words = ("classify", source, tmp_path / name, *TILES, "--where", condition, *more)
+            assert run(*words)[0] == 0
+        assert (tmp_path / "resumed.las").read_bytes() == (tmp_path / "fresh.las").read_bytes()
+
+
 def test_bridges_and_polygons_of_points_that_the_model_gives_another_class(
     tmp_path, run, write_las
 ):

@@ -81,7 +81,7 @@ def locations(path: str, column: str = "location") -> list[str]:
 
     refuse_pipe(path)
     pyogrio = optional_import("pyogrio", "vector", "tile indexes")
-    cure = f"It needs a column '{column}' with file names (option tindex_name)"
+    cure = f"It needs a column '{column}' with file names (pipelines: tindex_name)"
     with reading(path, "the tile index cannot be read", cure) as plain, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # GDAL's, of files that it reads nevertheless
         names = [*pyogrio.raw.read(plain, columns=[column], read_geometry=False)[3], None][0]
@@ -161,7 +161,7 @@ def named_outputs(target: str, names: Sequence[str]) -> list[str]:
             found=f"{len(names)} to {target}",
             cure="Name a folder (with a slash at its end), or put '#' where the name of the input "
             "or tile should be, e.g. classified_#.laz. To merge inputs into one file, use a "
-            "pipeline",
+            "pipeline without --tile",
         )
     return [str(path.with_name(path.name.replace("#", name))) for name in names]
 

@@ -63,6 +63,11 @@ class Reference:
         return name_of_wkt(self.wkt)
 
     @property
+    def plane(self) -> frozenset[str]:
+        """Return the parameters of its projection, as PDAL has them; empty without one."""
+        return described(self.wkt)[1] if self.wkt else frozenset()
+
+    @property
     def height(self) -> str:
         """Return the authority's code of the heights' system; empty where it is not known."""
         root = parse_wkt(self.wkt)
@@ -275,7 +280,7 @@ def check_one_reference(references: Mapping[str, Reference]) -> list[Message]:
         assumed = ", as there is no spatial reference" if reference.units.assumed else ""
         text = f"{across:g} m across and {upward:g} m upward in {path}{assumed}"
         named = f"{reference.name} in {path}"
-        plane = described(reference.wkt)[1] if several and reference.wkt else frozenset()
+        plane = reference.plane if several else frozenset()
         values = ((across, upward), text), (plane, named), (reference.height, named)
         for inputs, (value, shown) in zip(kinds.values(), values, strict=True):
             if value:

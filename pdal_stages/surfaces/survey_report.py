@@ -17,6 +17,7 @@ from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, check_outputs, write_json, write_whole
 from ..base.grid import GridWindow
 from ..base.json_types import JsonObject
+from ..base.messages import count_of
 from ..base.point_rows import read_point_rows
 from ..base.version import __version__
 from ..pipeline.inputs_outputs import input_files
@@ -279,7 +280,7 @@ def lines(result: JsonObject) -> list[str]:
     """Return what the command prints of a report."""
     density, voids, control = result["density"], result["voids"], result["control"]
     out = [
-        f"{result['survey']['points']:,} points, {density['all']['mean']:.1f} a m2",
+        f"{count_of(result['survey']['points'], 'point')}, {density['all']['mean']:.1f} a m2",
         f"{voids['count']:,} voids, {voids['area_m2']:,.0f} m2 ({100 * voids['share']:.2f} %)",
     ]
     for pair in result["strips"][:1]:

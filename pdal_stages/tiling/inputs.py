@@ -265,6 +265,11 @@ class Survey:
         more = f" (so are those of {len(odd) - 1:,} more inputs)" if len(odd) > 1 else ""
         self.messages += [Message(f"{text}{more}", Topic.INPUT) for text in odd[:1]]
 
+    @property
+    def system(self) -> list[object]:
+        """The units and the projection of the coordinates, however a file words them."""
+        return [vars(self.reference.units), sorted(self.reference.plane)]
+
     def warnings_of_boxes(self) -> list[Message]:
         """Return warnings about inputs with points outside the box in their header."""
         indexes = [source.index for source in self.sources if source.index]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..base.errors import PipelineError
 from ..base.files import LAS, Output, check_outputs
-from ..base.json_types import StageJson
+from ..base.json_types import JsonObject, StageJson
 from ..base.messages import Message
 from ..classifier.model_file import shipped
 from ..pipeline.copies import read_here
@@ -27,6 +27,10 @@ ROW = "PdalStagesRow"
 INPUT = "PdalStagesInput"
 #: Meters outside the tile; negative inside.
 OUTSIDE = "PdalStagesOutside"
+
+#: Fields of a plan of which each result depends on a part alone, or none at all.
+_APART = {"readers", "in_tiles", "rounds", "per_output", "files", "sees_m", "creates"}
+_APART |= {"messages", "name", "extra_dims", "makes"}
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,10 @@ class TilePlan:
     where: str | None = None  #: the points that stages act on, as they come in
     read_here: bool = False  #: PDAL does not read the points, and all stages in tiles are ours
     copied: bool = False  #: outputs are copies of inputs, without PDAL
+
+    def shared_fields(self) -> JsonObject:
+        """Return the fields on which results of all rounds depend; a new one is among them."""
+        return {name: value for name, value in vars(self).items() if name not in _APART}
 
     @property
     def writers(self) -> list[StageJson]:

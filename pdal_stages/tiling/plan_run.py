@@ -85,7 +85,7 @@ class PlanRun(SurveyRun):
         common = fingerprint(
             build(),
             [plan.in_tiles, survey.stamps_of(plan.files[:count]), plan.creates, plan.halo_m, sees],
-            [vars(grid), survey.options.most_points],
+            [plan.shared_fields(), survey.system, vars(grid), survey.options.most_points],
             writing if per_tile else [],
         )
         for tile, points in survey.tiles().items():

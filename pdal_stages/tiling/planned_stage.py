@@ -98,6 +98,8 @@ def check_linear(stages: list[PlannedStage]) -> None:
                 "a pipeline in tiles is linear: readers, then filters, then writers",
                 where=stage.where,
                 found=f"{stage.type} after {before.type}",
+                cure="Put the writers last; run what comes after one on its files, by another "
+                "pipeline",
             )
         wanted = stage.options.pop("inputs", None) or []
         names = {wanted} if isinstance(wanted, str) else set(map(str, wanted))

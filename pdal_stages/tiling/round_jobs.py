@@ -137,7 +137,7 @@ class RoundJobs:
         box = survey.squares.box(square, far)
         digest = fingerprint(
             [build(), stages, survey.stamps_of(self.run.plan.files[: len(stages)])],
-            [vars(survey.grids), survey.unit, vars(part), square],
+            [self.run.plan.shared_fields(), survey.system, vars(survey.grids), vars(part), square],
             [source.content for source in survey.near_box(box) if not source.fault],
         )
         name = square_name(self.run.context, number, square)
