@@ -132,7 +132,7 @@ def test_a_reason_of_several_tiles_is_told_once(tmp_path, folder, capsys):
     words = ["--tile", "40", "--buffer", "0", "--workers", "0", "--no-progress"]
     assert main(["pipeline", str(tmp_path / "job.json"), *words]) == 1
     said = capsys.readouterr().err
-    assert said.count("no ground is given") == 1 and "tile 0_0 and 1 more: " in said, said
+    assert said.count("no ground is given") == 1 and "tile 0_0, tile 40_0: " in said, said
 
 
 def test_a_failure_of_every_tile_stops_the_run(tmp_path, folder):

@@ -23,8 +23,10 @@ from .parser import Parser
 if TYPE_CHECKING:
     from ..tiling.jobs import TiledRun, WritingJob
 
-#: Failures that are printed, a screenful; reports hold all of them.
+#: Reasons of failures that are printed, a screenful; reports hold all of them.
 _MOST_FAILURES = 20
+#: Names of what failed for one reason that are printed.
+_MOST_NAMES = 10
 #: Tiles of a dry run that are printed.
 _MOST_TILES = 50
 
@@ -209,13 +211,13 @@ def _other_states(states: Mapping[str, int]) -> str:
 
 
 def _print_failures(run: TiledRun) -> None:
-    """Print the first reasons of failures, each with the first that failed for it."""
+    """Print the first reasons of failures, each with what failed for it."""
     failed: dict[str, list[str]] = {}
     for what, reason in run.failures:
         failed.setdefault(reason, []).append(what)
     for reason, names in [*failed.items()][:_MOST_FAILURES]:
-        more = f" and {len(names) - 1:,} more" if len(names) > 1 else ""
-        print_messages(f"{names[0]}{more}: {reason}")
+        more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""
+        print_messages(f"{', '.join(names[:_MOST_NAMES])}{more}: {reason}")
     if len(failed) > _MOST_FAILURES:
         print_messages(f"and {len(failed) - _MOST_FAILURES:,} more reasons; see --report")
 
