@@ -88,6 +88,31 @@ def test_a_dimension_that_cannot_be_written_is_refused_before_any_tile(
     assert not out and not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("way", ["tiles", "pipeline", "train"])
+def test_a_dimension_that_one_input_lacks_is_not_taken_for_zero(
+    folder, classify, tmp_path, run, way
+):
+    dimensions = "--writers.classifiermodel.dimensions=HeightAboveGround,Amplitude"
+    words = ["train", folder / "in" / "t0.laz", "--model", tmp_path / "m", *QUICK_TRAINING]
+    assert run(*words, dimensions)[0] == 0
+    if way == "tiles":
+        code, _, err = run(
+            *("classify", folder / "in", tmp_path / "out/", "--tile", 20, "--workers", 0),
+            *("--model", tmp_path / "m"),
+        )
+    elif way == "pipeline":
+        readers = [str(folder / "in" / f"t{number}.laz") for number in (1, 0)]
+        heights = {"type": "filters.hag_minima"}
+        model = {"type": "filters.modelclassifier", "model": str(tmp_path / "m")}
+        stages = [*readers, heights, model, str(tmp_path / "o.las")]
+        (tmp_path / "job.json").write_text(json.dumps(stages))
+        code, _, err = run("pipeline", tmp_path / "job.json")
+    else:
+        words[1] = folder / "in"
+        code, _, err = run(*words, dimensions)
+    assert code == 1 and "'Amplitude' is missing in " in err and "t1.laz without it" in err, err
+
+
 def test_several_inputs_are_not_merged_into_one(folder, classify, tmp_path):
     code, _, err = classify(folder / "in", tmp_path / "all.laz")
     assert code == 1 and "#" in err and not list(tmp_path.iterdir())

@@ -9,14 +9,14 @@ from __future__ import annotations
 import copy
 import itertools
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ..base.dimensions import known
 from ..base.errors import DimensionError, PipelineError, StageError
 from ..base.json_types import StageJson
-from ..base.las_points import layout_there
-from ..base.messages import Message
+from ..base.las_points import Layout, layout_there
+from ..base.messages import Message, count_of
 from ..classifier.model_file import find
 from ..features.registry import BY_NAME
 from ..stages import preprocessing
@@ -209,16 +209,50 @@ def check_dimensions(expanded: Expanded) -> None:
                 "projected reference",
             )
         for name in ours.stage.reads():
-            if _is_created(name) and not any(
-                name in of_ours[index] if index in of_ours else _may_create(name, stage)
-                for index, stage in before
-            ):
+            if _is_created(name) and not _may_be_made(name, before, of_ours):
                 raise DimensionError(
                     f"the dimension '{name}' is missing: no stage before creates it, and no input "
                     "has it",
                     where=ours.stage.place,
                     cure=ours.stage.hint or MAKERS.get(name),
                 )
+
+
+def check_shared_dimensions(
+    expanded: Expanded, layouts: Mapping[str, Layout], last: Stage | None = None
+) -> None:
+    """Refuse files, by path, that lack a dimension which a stage reads, where others have it.
+
+    Points of several files together would have 0 there. `last` is a stage after all of the
+    pipeline.
+    """
+    of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
+    with_points = {path: each for path, each in layouts.items() if each.header.count}
+    readings = [(ours.index, ours.stage) for ours in expanded.ours]
+    readings += [(len(expanded.stages), last)] if last else []
+    for index, stage in readings:
+        before = [(n, s) for n, s in enumerate(expanded.stages[:index]) if not is_reader(s)]
+        for name in stage.reads():
+            lacking = [path for path, layout in with_points.items() if name not in layout.fields]
+            if not 0 < len(lacking) < len(with_points) or _may_be_made(name, before, of_ours):
+                continue
+            raise DimensionError(
+                f"the dimension '{name}' is missing in {count_of(len(lacking), 'input')}, and "
+                "others have it",
+                where=stage.place,
+                found=f"{lacking[0]} without it",
+                cure="Run those that have it by themselves, or give it to all",
+            )
+
+
+def _may_be_made(
+    name: str, before: Iterable[tuple[int, StageJson]], of_ours: Mapping[int, Mapping[str, str]]
+) -> bool:
+    """Return whether a stage before, by its index, may make a dimension; `of_ours` are known to."""
+    return any(
+        name in of_ours[index] if index in of_ours else _may_create(name, stage)
+        for index, stage in before
+    )
 
 
 def _is_created(name: str) -> bool:

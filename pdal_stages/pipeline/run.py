@@ -21,13 +21,21 @@ from ..base.files import Output, check_outputs, whole_files
 from ..base.json_types import JsonObject, StageJson
 from ..base.las import refuse_pipe, supersede_copc
 from ..base.las_check import check_complete, check_readable
+from ..base.las_points import layout_there
 from ..base.messages import Message, Report, Topic
 from ..base.octrees import check_copc, check_ept
 from ..base.text_points import check_text
 from ..stages.registry import stage_types
 from . import copies, pdal_facts, runtime
 from . import pdal as pdal_env
-from .expansion import Expanded, check_dimensions, expand, fuse_scripts, stage_files
+from .expansion import (
+    Expanded,
+    check_dimensions,
+    check_shared_dimensions,
+    expand,
+    fuse_scripts,
+    stage_files,
+)
 from .inputs_outputs import (
     ept_address,
     is_reader,
@@ -292,6 +300,9 @@ class Pipeline:
         files = readers_files(stages, las=True)
         odd = filter(None, map(check_readable, files))
         self.warnings = [*self.expanded.warnings, *(Message(text, Topic.INPUT) for text in odd)]
+        read = [(stage, path) for stage in stages for path in readers_files([stage], las=True)]
+        layouts = {p: copies.layout_read_by(each, p) for each, p in read if layout_there(p)}
+        check_shared_dimensions(self.expanded, layouts)
         if pdal:
             pdal_facts.check_inputs(stages)
             pdal_facts.check_units(stages)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -14,12 +14,14 @@ from ..base.errors import DependencyError, StageError
 from ..base.files import create_folder, sweep
 from ..base.jit import count_cached_kernels
 from ..base.json_types import StageJson
+from ..base.las_points import Layout
 from ..base.messages import print_messages
+from ..pipeline.expansion import check_shared_dimensions
 from ..pipeline.json_source import Override
 from ..pipeline.pdal_facts import check_flags, check_inputs, check_units
 from ..pipeline.run import Pipeline
 from .estimate import estimate
-from .inputs import Survey
+from .inputs import InputSource, Survey
 from .jobs import InterruptedRun, Store, TiledRun, WritingJob
 from .options import TilingOptions
 from .plan import TilePlan, make_plan
@@ -94,6 +96,8 @@ def run_plan(
     if not plan.copied:
         _refuse_misread(plan, survey, chosen.per == "tile")
     _refuse_uncopied(plan, survey)
+    if pipeline is not None:
+        _refuse_lacking(pipeline, survey)
     if pipeline is not None and not plan.copied:
         _try_on_an_input(pipeline, survey, len(plan.readers))
     if dry_run:
@@ -140,12 +144,24 @@ def _refuse_misread(plan: TilePlan, survey: Survey, together: bool) -> None:
 
 def _refuse_uncopied(plan: TilePlan, survey: Survey) -> None:
     """Refuse inputs of which no copy can be written with what stages create."""
+    for source, layout in _layouts(survey):
+        copy_in(plan, source, layout, ".las", {})
+
+
+def _refuse_lacking(pipeline: Pipeline, survey: Survey) -> None:
+    """Refuse inputs without a dimension that stages read and others have."""
+    layouts = {source.path: layout for source, layout in _layouts(survey)}
+    check_shared_dimensions(pipeline.expanded, layouts)
+
+
+def _layouts(survey: Survey) -> Iterator[tuple[InputSource, Layout]]:
+    """Yield inputs with their layouts; reading the others reports what is wrong with them."""
     for source in survey.readable():
         try:
             layout = source.layout
         except StageError:
-            continue  # which reading it reports
-        copy_in(plan, source, layout, ".las", {})
+            continue
+        yield source, layout
 
 
 def _try_on_an_input(pipeline: Pipeline, survey: Survey, readers: int) -> None:

@@ -15,7 +15,7 @@ from ..base.distinct import DistinctPoints
 from ..base.errors import OptionError, StageError
 from ..base.files import check_outputs
 from ..base.json_types import StageJson
-from ..base.las_points import columns_of_files
+from ..base.las_points import columns_of_files, layout_there
 from ..base.memory import free_memory
 from ..base.messages import Message, Report, drop_repeated
 from ..classifier.model import Model
@@ -23,7 +23,7 @@ from ..classifier.training import train
 from ..classifier.training_clouds import TrainingCloud
 from ..classifier.training_options import TrainingOptions
 from ..pipeline import pdal as pdal_env
-from ..pipeline.expansion import stage_files
+from ..pipeline.expansion import check_shared_dimensions, stage_files
 from ..pipeline.json_source import Override, overridden
 from ..pipeline.pdal import reader_of
 from ..pipeline.run import Pipeline
@@ -141,6 +141,8 @@ class TrainTask:
         messages = check_readers(readers)
         stages = [*map(dict, heights)] or [{"type": "filters.merge"}]  # one end of all readers
         pipeline = Pipeline([*readers, *stages], self._other_overrides)
+        layouts = {path: layout for path in files if (layout := layout_there(path)) is not None}
+        check_shared_dimensions(pipeline.expanded, layouts, self.stage)
         if pipeline.is_read_here:
             pipeline.settle_inputs(pdal=False)
             columns = columns_of_files(files)
