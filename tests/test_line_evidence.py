@@ -54,22 +54,25 @@ def lies_on_line(point, p_point, parts, p, guides, p_guides):
     p, p_guides = p[near(parts)].astype(float), p_guides[near(guides)].astype(float)
     parts, guides = parts[near(parts)] - point, guides[near(guides)] - point
     most = RULES.guides
-    width = RULES.width if p_point >= RULES.likely else RULES.unlikely_width
+    side = 0.0 if p_point >= RULES.likely else RULES.side
     for toward in guides[:: max(1, len(guides) ** 2 // RULES.looks)]:
         if np.hypot(*toward[:2]) < RULES.far:
             continue
         _, away = beside(guides, toward)
-        of_guides = (p_guides * np.maximum(0, 1 - (away / width) ** 2)).sum()
+        of_guides = (p_guides * np.maximum(0, 1 - (away / RULES.width) ** 2)).sum()
         if of_guides < most:
             continue
         most = of_guides
         along, away = beside(parts, toward)
-        tube, ring = away <= width, away <= RULES.ring
+        tube, ring = away <= RULES.width, away <= RULES.ring
         places = np.sort(along[tube])
-        low, high = -end(-places[::-1], RULES.gap), end(places, RULES.gap)
-        worth = np.where(tube, 1 - (away / width) ** 2, -RULES.against * (1 - p_point) * ring)
+        gap = RULES.usual_gaps * sorted(np.diff(places))[(len(places) - 2) // 2]
+        low, high = (sign * end(np.sort(sign * places), min(RULES.gap, gap)) for sign in (-1, 1))
+        worth = np.where(tube, 1 - (away / RULES.width) ** 2, -RULES.against * (1 - p_point) * ring)
         between = (along >= low) & (along <= high)
-        if high - low >= RULES.length and (p * worth)[between].sum() >= RULES.evidence:
+        enough = (p * worth)[between].sum() >= RULES.evidence
+        sides = [(p * worth)[between & tube & (sign * along > 0)].sum() for sign in (-1, 1)]
+        if high - low >= RULES.length and enough and min(sides) >= side:
             return True
     return False
 
@@ -126,7 +129,24 @@ def test_a_wire_is_long_and_alone_and_needs_likely_points():
 def test_all_candidates_look_toward_guides_that_lie_on_lines():
     xyz = wire(60.0)
     p = np.where(np.arange(len(xyz)) % 3, 0.06, 1.0).astype(np.float32)
-    assert find_lines(xyz, p).all()
+    assert find_lines(xyz, p)[:-2].all()
+
+
+def test_what_is_no_guide_lies_between_parts_of_its_line():
+    xyz = wire(60.0)
+    p = np.where(np.abs(xyz[:, 0] - 30.0) < 20.0, 0.9, 0.2).astype(np.float32)
+    ends = np.flatnonzero(~find_lines(xyz, p))  # beyond them less than 0.5 of evidence
+    assert ends.tolist() == [0, 1, 2, 57, 58, 59]
+    assert find_lines(xyz, np.full(60, 0.9, np.float32)).all()
+
+
+def test_gaps_of_a_line_are_of_the_kind_of_its_usual_ones():
+    dense = wire(18.0, 0.6, sag=0.0)
+    apart = np.concatenate([dense[:14], dense[14:] + (9.0, 0.9, 0.0)])
+    sparse = wire(60.0, 3.0, sag=0.0)
+    thinned = np.concatenate([sparse[:8], sparse[8:] + (9.0, 0.9, 0.0)])
+    assert not find_lines(apart, np.ones(len(apart), np.float32)).any()
+    assert find_lines(thinned, np.ones(len(thinned), np.float32)).all()
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,10 @@ A wire is long; what looks like one in a crown, at a roof's edge or in a sliver 
 So a low probability makes a point a *candidate*, and the line decides. A line is a tube from one
 candidate toward a likely one, a *guide*: candidates in the tube speak for it by their probability,
 those in a ring around the tube against it, the less the likelier the candidate itself is: a likely
-wire may hang beside others, an unlikely one is a twig beside a wire. A line is looked at where its
-guides count at least as much as those of all lines that the candidate tried before.
+wire may hang beside others, an unlikely one is a twig beside a wire. What is no guide lies between
+parts of its line: beyond the end of a wire stand what holds it and what hides the rest. A line is
+looked at where its guides count at least as much as those of all lines that the candidate tried
+before.
 
 There are two steps: guides must lie on lines themselves, and then every candidate looks toward the
 guides that do. Where no candidate is likely, next to nothing is computed.
@@ -49,18 +51,19 @@ class LineEvidenceRules(NamedTuple):
     releases do: see CONTRIBUTING.md.
     """
 
-    candidate: float = 0.05  #: probability from which on a point may belong to a line
+    candidate: float = 0.03  #: probability from which on a point may belong to a line
     likely: float = 0.35  #: probability from which on a candidate is a guide
     evidence: float = 5.0  #: of a line, at least: candidates in the tube, less those in the ring
     guides: float = 3.0  #: evidence of guides alone in the tube, at least
+    side: float = 0.5  #: evidence in the tube on either side of what is no guide, at least
     length: float = 10.0  #: least extent of a line
-    gap: float = 16.0  #: largest gap in it: thin wires give few echoes
+    gap: float = 16.0  #: largest gap in it: thin wires give few echoes, ...
+    usual_gaps: float = 10.0  #: ... and the same in usual gaps: those of others lie at equal steps
     radius: float = 32.0  #: candidates up to this far away, in plan, are looked at
-    width: float = 0.4  #: radius of a guide's tube: a wire sags, and its echoes scatter by 0.1 m
-    unlikely_width: float = 0.32  #: of other candidates' tubes: what is beside a wire is none
+    width: float = 0.4  #: radius of the tube: a wire sags, and its echoes scatter by 0.1 m
     ring: float = 1.2  #: outer radius of the ring around it
     #: what a candidate in the ring counts, times how unlikely the point on the line is
-    against: float = 1.5
+    against: float = 0.75
     far: float = 5.0  #: guides farther away than this tell directions
     cube: float = 0.5  #: of each cube of this side the likeliest candidate counts
     looks: int = 1 << 17  #: guides looked at for a point at most: of many, lines to some are tried
@@ -183,21 +186,21 @@ def _mark(points, probability, place, parts, guides, rules, out):
         every, m = near, 0
         most = rules.guides
         against = rules.against * (1.0 - probability[k])
-        width = rules.width if probability[k] >= rules.likely else rules.unlikely_width
+        side = 0.0 if probability[k] >= rules.likely else rules.side
         for toward in range(0, n, max(1, n * n // rules.looks)):
             away = np.sqrt(near[0, toward] ** 2 + near[1, toward] ** 2)
             if away < rules.far:
                 continue
             line = near[0, toward] / away, near[1, toward] / away, near[2, toward] / away
-            of_guides = _evidence_in_tube(near, n, line, width)
+            of_guides = _evidence_in_tube(near, n, line, rules.width)
             if of_guides < most:
                 continue
             most = of_guides
             if m == 0:
                 every, m = _near(points[k], place[k], parts, rules.radius)
-            if _evidence_in_tube(every, m, line, width) < 0.99 * rules.evidence:
+            if _evidence_in_tube(every, m, line, rules.width) < 0.99 * rules.evidence:
                 continue  # the whole tube is not enough: no need to look for gaps and at the ring
-            if _evidence_of_line(every, m, line, width, against, rules) >= rules.evidence:
+            if _evidence_of_line(every, m, line, against, side, rules) >= rules.evidence:
                 out[k] = True
                 break
 
@@ -231,8 +234,8 @@ def _evidence_in_tube(near, n, line, width):
 
 
 @device(_nrt=True)
-def _evidence_of_line(near, n, line, width, against, rules):
-    """Return what n parts count for a line through 0, along which gaps are small; 0 if short."""
+def _evidence_of_line(near, n, line, against, side, rules):
+    """Return what n parts count for a line through 0; 0 if it is short or too little on a side."""
     u, v, rise = line
     along, worth = np.empty(n), np.empty(n)
     inside, outside = 0, n  # the tube's parts come first, the ring's last
@@ -242,21 +245,30 @@ def _evidence_of_line(near, n, line, width, against, rules):
             continue
         place = near[0, k] * u + near[1, k] * v
         beside = aside * aside + (near[2, k] - place * rise) ** 2
-        if beside <= width**2:
+        if beside <= rules.width**2:
             along[inside] = place
-            worth[inside] = near[3, k] * (1.0 - beside / width**2)
+            worth[inside] = near[3, k] * (1.0 - beside / rules.width**2)
             inside += 1
         elif beside <= rules.ring**2:
             outside -= 1
             along[outside], worth[outside] = place, -against * near[3, k]
-    low, high = _ends(np.sort(along[:inside]), rules.gap)
+    places = np.sort(along[:inside])
+    low, high = _ends(places, min(rules.gap, rules.usual_gaps * _usual_gap(places)))
     if high - low < rules.length:
         return 0.0
-    total = 0.0
+    total, behind, ahead = 0.0, 0.0, 0.0
     for k in range(n):
         if (k < inside or k >= outside) and low <= along[k] <= high:
             total += worth[k]
-    return total
+            behind += worth[k] * (k < inside and along[k] < 0.0)
+            ahead += worth[k] * (k < inside and along[k] > 0.0)
+    return total if min(behind, ahead) >= side else 0.0
+
+
+@device(_nrt=True)
+def _usual_gap(along):
+    """Return the median of the gaps between places (n,), ascending."""
+    return np.sort(np.diff(along))[(len(along) - 2) // 2] if len(along) > 1 else 0.0
 
 
 @device
