@@ -59,9 +59,9 @@ def models(cloud):
 
 
 def test_candidates_are_set_aside_and_what_can_be_nothing_else_stays():
-    p = np.array([[0.6, 0.37, 0.03], [0.5, 0.3, 0.2], [0.0, 0.1, 0.9], [0.0, 0.0, 1.0]])
+    p = np.array([[0.6, 0.38, 0.02], [0.5, 0.3, 0.2], [0.0, 0.1, 0.9], [0.0, 0.0, 1.0]])
     block, columns = set_lines_aside(Block(np.arange(4), p), IS_LINE, CODES)
-    expected = [[0.6, 0.37, 0.03], [0.625, 0.375, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    expected = [[0.6, 0.38, 0.02], [0.625, 0.375, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     np.testing.assert_allclose(block.probabilities, expected)
     np.testing.assert_allclose(columns["line_probability"], [0.0, 0.2, 0.9, 1.0], rtol=1e-6)
     assert columns["line_class"].tolist() == [0, 14, 14, 14]
@@ -105,7 +105,7 @@ def test_unlikely_points_on_a_line_are_of_it_and_likely_ones_on_none_are_not(mod
     rng = np.random.default_rng(3)
     specks = rng.uniform((0, 100, 5), (60, 160, 15), (60, 3))
     xyz = np.concatenate([wire(60.0), specks])
-    share = np.float32([*np.where(np.arange(120) % 3, 0.1, 0.6), *np.full(60, 0.9)])
+    share = np.float32([*np.where(np.arange(120) % 7, 0.1, 0.6), *np.full(60, 0.9)])
     prediction = Prediction(
         np.full(180, 5, np.uint8),
         np.full(180, 0.8, np.float32),
