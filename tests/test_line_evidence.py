@@ -141,10 +141,11 @@ def test_what_is_no_guide_lies_between_parts_of_its_line():
 
 
 def test_gaps_of_a_line_are_of_the_kind_of_its_usual_ones():
+    away = np.array((9.0, 0.9, 0.0))
     dense = wire(18.0, 0.6, sag=0.0)
-    apart = np.concatenate([dense[:14], dense[14:] + (9.0, 0.9, 0.0)])
+    apart = np.concatenate([dense[:14], dense[14:] + away])
     sparse = wire(60.0, 3.0, sag=0.0)
-    thinned = np.concatenate([sparse[:8], sparse[8:] + (9.0, 0.9, 0.0)])
+    thinned = np.concatenate([sparse[:8], sparse[8:] + away])
     assert not find_lines(apart, np.ones(len(apart), np.float32)).any()
     assert find_lines(thinned, np.ones(len(thinned), np.float32)).all()
 
