@@ -51,6 +51,7 @@ from pdal_stages.terrain import (
     filter_options,
     filtered_ground,
     low_outliers,
+    noise,
     openings,
     regain,
     smrf,
@@ -299,14 +300,18 @@ ROWS: dict[str, dict[str, Row]] = {
         "as it is": Row(),
         "voxels do not widen in thin clouds": rule(detached, sides=(2.0,)),
         "voxels do not widen where company is missing": rule(detached, max_lonely=1.0),
-        "sparse swarms hold": rule(detached, min_mean=0.0),
-        "nearly empty voxels hold": rule(detached, min_mean=0.0, min_around=0),
+        "sparse swarms hold": rule(detached, min_more=0),
+        "nearly empty voxels hold": rule(detached, min_more=0, min_around=0),
         "dense clusters stay small": rule(detached, cluster_area_m2=0.0),
         "long pieces of wires are clusters": rule(detached, line_columns=99),
         "nothing holds what is near": rule(detached, hold_columns=0, hold_sides=0.0),
-        "low: no ground as deep is looked for": rule(low_outliers, min_company=10**6),
-        "low: ground as deep needs no support": rule(
-            low_outliers, min_support=-1, min_support_share=0.0
+        "large clusters are never covered": rule(detached, min_covered=2.0),
+        "low: crowns are land": Row(noise, "BELOW_RULES", low_outliers.RULES),
+        "low: no ground as deep is looked for": Row(
+            noise, "BELOW_RULES", noise.BELOW_RULES._replace(min_company=10**6)
+        ),
+        "low: ground as deep needs no support": Row(
+            noise, "BELOW_RULES", noise.BELOW_RULES._replace(min_support=-1, min_support_share=0.0)
         ),
     },
     "decks": {

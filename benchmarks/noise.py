@@ -5,6 +5,7 @@ python benchmarks/noise.py --data FOLDER --classify
 python benchmarks/noise.py --data FOLDER --terrain
 python benchmarks/noise.py --data FOLDER --surveys
 python benchmarks/noise.py --data FOLDER --thinned
+python benchmarks/noise.py --data FOLDER --canopies
 python benchmarks/noise.py --places
 
 Noise as the field knows it is put into each cloud: points and clusters of 2 to 30 within a meter,
@@ -17,8 +18,9 @@ noise at once (:func:`kinds_of_noise`): how much of each is found, in all and of
 5 m from every good point, and how many good points are marked, by this stage, by PDAL's
 filters.outlier (statistical, 8 neighbors, multiplier 3) and by counts in voxels of 1 m (lasR's ivf:
 at most 6 points in 27 voxels). With --thinned, how
-many good points of the 29 surveys are marked as flown and thinned. With --places, generated land
-that holds no noise: how much of its ground is marked.
+many good points of the 29 surveys are marked as flown and thinned, and how many of the power line's
+wires. With --canopies, real woods that lose ground until hardly any is left: how much of the rest is
+marked. With --places, generated land that holds no noise: how much of its ground is marked.
 """
 
 from __future__ import annotations
@@ -371,6 +373,16 @@ def surveys(folder: Path) -> None:
         print(f"| {finder} | {means[0]:.4f} % | {worst:.3f} % | {' | '.join(cells)} |")
 
 
+def wires(xyz: np.ndarray, codes: np.ndarray, order: np.ndarray) -> list[str]:
+    """Return what share of the wires is marked at some densities, by points/m2 that keep points."""
+    out = []
+    for points in (np.inf, 7, 4, 2, 1, 0.3):
+        kept = order < points
+        marked = detached_noise(xyz[kept])[codes[kept] == 14] > 0
+        out.append(f"{points:g} points/m²: {marked.sum()} of {len(marked)}")
+    return out
+
+
 def thinned(folder: Path) -> None:
     """Print how many good points of the surveys are marked, in percent, as flown and thinned."""
     print("| survey | as flown | " + " | ".join(f"{d:g} points/m²" for d in THINNED) + " |")
@@ -378,9 +390,9 @@ def thinned(folder: Path) -> None:
     shares = []
     for name, known in SURVEYS.items():
         xyz, codes, _ = published(folder, known)
-        xyz = xyz[~np.isin(codes, known.dropped)]
-        density = len(xyz) / (25 * len(np.unique(np.floor(xyz[:, :2] / 5), axis=0)))
-        order = hash_rows(xyz.T, 0)
+        good = ~np.isin(codes, known.dropped)
+        xyz, codes = xyz[good], codes[good]
+        density, order = density_of(xyz), hash_rows(xyz.T, 0)
         row = [
             100 * (detached_noise(xyz[order < np.uint64(least)]) > 0).mean() if part < 1 else np.nan
             for part, least in ((d / density, min(d / density, 0.999) * 2.0**64) for d in THINNED)
@@ -389,8 +401,62 @@ def thinned(folder: Path) -> None:
         print(
             f"| {name} | " + " | ".join(f"{share:.4f}" for share in shares[-1]) + " |", flush=True
         )
+        if (codes == 14).any():
+            print(f"| its wires at {', '.join(wires(xyz, codes, order / 2.0**64 * density))} |")
     for word, value in (("mean", np.nanmean), ("worst", np.nanmax)):
         print(f"| {word} | " + " | ".join(f"{v:.4f}" for v in value(shares, axis=0)) + " |")
+
+
+def density_of(xyz: np.ndarray) -> float:
+    """Return the points per m2 of squares of 5 m that hold any."""
+    return len(xyz) / (25 * len(np.unique(np.floor(xyz[:, :2] / 5), axis=0)))
+
+
+def wooded(xyz: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """Return which points lie in squares of 20 m with trees of 8 m, half of the points or more, and
+    hardly any buildings."""
+    square = np.unique(np.floor(xyz[:, :2] / 20), axis=0, return_inverse=True)[1]
+    count = np.bincount(square)
+    low, high = np.full((2, len(count)), np.nan)
+    np.fmin.at(low, square, xyz[:, 2])
+    np.fmax.at(high, square, xyz[:, 2])
+    plants = np.bincount(square, np.isin(codes, (1, 3, 4, 5))) / count
+    houses = np.bincount(square, codes == 6) / count
+    return ((plants > 0.5) & (houses < 0.02) & (high - low > 8) & (count > 20))[square]
+
+
+def canopies(folder: Path) -> None:
+    """Print how much of the ground that woods have left is marked low and high, in percent."""
+    print("| points/m² | share of ground | clouds | low, mean | worst | high, mean | worst |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    rows: dict[tuple[float, float], list[list[float]]] = {}
+    for known in SURVEYS.values():
+        xyz, codes, _ = published(folder, known)
+        good = ~np.isin(codes, known.dropped)
+        xyz, codes = xyz[good], codes[good]
+        under = wooded(xyz, codes) & (codes == 2)
+        if under.sum() < 200:
+            continue
+        density, order = density_of(xyz), hash_rows(xyz.T, 0) / 2.0**64
+        beside = wooded(xyz, codes) & (codes != 2)
+        for points in (np.inf, 1.0, 0.3):
+            if density < points < np.inf:
+                continue
+            kept = order < points / density
+            for share in (0.005, 0.01, 0.03):
+                left = share / (1 - share) * (kept & beside).sum() / max((kept & under).sum(), 1)
+                use = kept & (
+                    ~under | (hash_rows(xyz.T, 1) < np.uint64(min(left, 0.999) * 2.0**64))
+                )
+                if left < 1 and (use & under).any():
+                    marked = detached_noise(xyz[use])[under[use]]
+                    rows.setdefault((points, share), []).append(
+                        [100 * (marked == code).mean() for code in (7, 18)]
+                    )
+    for (points, share), values in rows.items():
+        flown = "as flown" if np.isinf(points) else f"{points:g}"
+        cells = [f"{np.mean(v):.3f} | {np.max(v):.2f}" for v in zip(*values, strict=True)]
+        print(f"| {flown} | {share:.1%} | {len(values)} | {' | '.join(cells)} |")
 
 
 def main() -> None:
@@ -401,11 +467,15 @@ def main() -> None:
     parser.add_argument("--terrain", action="store_true")
     parser.add_argument("--surveys", action="store_true")
     parser.add_argument("--thinned", action="store_true")
+    parser.add_argument("--canopies", action="store_true")
     parser.add_argument("--places", action="store_true")
     options = parser.parse_args()
     folder = options.data
     if options.places:
         places()
+        return
+    if options.canopies:
+        canopies(folder)
         return
     if options.thinned:
         thinned(folder)

@@ -39,7 +39,7 @@ class Noise:
     """The verdict of the noise stage on a point."""
 
     code: int  #: 7, 18 or 0
-    state: str  #: solid, held, loose, heavy or unjudged, see :mod:`..terrain.detached`
+    state: str  #: solid, held, loose or unjudged, see :mod:`..terrain.detached`
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..stages.apply_model import ApplyModel
 from ..stages.base import Kept
 from ..stages.detached_noise import DetachedNoise
 from ..stages.hag_morphological import HagMorphological
-from ..terrain.detached import HEAVY, HELD, LOOSE, SOLID, UNJUDGED
+from ..terrain.detached import HELD, LOOSE, SOLID, UNJUDGED
 from ..terrain.heights import JUDGED, PLACED
 from .explanation import (
     TOWERS,
@@ -43,7 +43,7 @@ _LOWER_M = 1.0
 #: them.
 _COMPARED = {"HeightAboveGround": 1 / 32, "Reliability": 1 / 64}
 #: Names of states of noise.
-_STATES = {SOLID: "solid", HELD: "held", LOOSE: "loose", HEAVY: "heavy", UNJUDGED: "unjudged"}
+_STATES = {SOLID: "solid", HELD: "held", LOOSE: "loose", UNJUDGED: "unjudged"}
 #: Stages after the model by the options that run them.
 _OPTIONS = {
     "filters.towers": TOWERS,

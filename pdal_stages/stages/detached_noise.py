@@ -17,15 +17,15 @@ class DetachedNoise(ClassStage):
 
     type = "filters.detachednoise"
     summary = "Mark points and small clusters detached from everything as low and high noise"
-    algorithm_version = 4
+    algorithm_version = 5
     low = Count("marked as low noise")
     high = Count("marked as high noise")
     reads_around = frozenset()  # classes alone, by `ignore`
     cluster: int = option(
         "integer",
         30,
-        "Maximum number of points of a noise cluster; in clouds of more than 10 points/m2 as many "
-        "as lie on 3 m2",
+        "Maximum number of points of a noise cluster; in clouds of more than 15 points/m2 as many "
+        "as lie on 2 m2",
         *(1, 1_000_000),
     )
     gap: float = option(

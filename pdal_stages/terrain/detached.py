@@ -4,9 +4,9 @@ Space is cut into voxels that are the wider the thinner the cloud is around, so 
 and crowns of a survey fill voxels that touch. They are widened where more than one point in ten has
 little company; where that is so in the widest, as in thin clouds of steep forests, gaps tell
 nothing, and nothing is detached. A voxel is solid if it belongs to a component of voxels that
-touch, none of them nearly empty, and that is large or long and thin as a wire. All else is
-detached: held if something solid is close, loose if not. All is counted on absolute grids, so that
-the order of points, tiles and threads do not matter.
+touch, none of them nearly empty, and that is large, long and thin as a wire, or of many points
+under the open sky. All else is detached: held if something solid is close, loose if not. All is
+counted on absolute grids, so that the order of points, tiles and threads do not matter.
 """
 
 from __future__ import annotations
@@ -33,13 +33,10 @@ LAYERS = 1 << (BITS - 1)
 SHARE = 1 << 18
 #: State of what belongs to a large component.
 SOLID: int = 0
-#: State of what is detached and has something solid close.
+#: State of what is detached and has something solid close, or many points under others.
 HELD: int = 1
 #: State of what is detached and has not.
 LOOSE: int = 2
-#: State of a compact component of more points than a cluster, with nothing solid close: ground in a
-#: courtyard, or many echoes from below.
-HEAVY: int = 3
 #: State of what nobody has judged.
 UNJUDGED: int = 255
 
@@ -59,10 +56,14 @@ class DetachedRules(NamedTuple):
     min_company: int = 24
     max_lonely: float = 0.1  #: where a larger share of the points lacks it voxels are widened
     flat_m: float = 1.5  #: voxels are not higher than this, or than half their side
-    min_around: int = 4  #: points in a voxel and the 26 around it: with fewer it is nearly empty
-    min_mean: float = 2.0  #: so it is with fewer per voxel that holds points, as in a swarm ...
-    max_line_voxels: int = 6  #: ... if more voxels than these do: a wire passes through few
-    cluster_area_m2: float = 3.0  #: a cluster may hold as many points as lie on this much ground
+    #: a voxel is nearly empty with fewer points in it and the 26 around it, where up to three of
+    #: these hold any, as along a wire ...
+    min_around: int = 3
+    min_more: int = 2  #: ... and this many more for each further one, as in a swarm
+    #: a cluster may hold as many points as lie on this much ground: of the clusters of more than 30
+    #: points in the surveys that are not noise the smallest lies on 3.2 m2
+    cluster_area_m2: float = 2.0
+    min_covered: float = 0.8  #: larger ones are detached if this share lies under others
     extent_sides: float = 5.0  #: no cluster is longer than this, in sides of a voxel, ...
     extent_m: float = 15.0  #: ... and this, in meters
     line_columns: int = 3  #: a piece of a wire is at least this long, in columns, ...
@@ -108,21 +109,20 @@ class Voxels(NamedTuple):
         height = min(side, max(RULES.flat_m, side / 2))
         return cls(side, height, left, bottom, points.shape[1] * per_block + 2 * rim)
 
-    def sum_in_blocks(self, keys: NDArray, values: NDArray, shape: tuple[int, int]) -> NDArray:
-        """Return the sums of values (n,) of voxels in blocks, `shape`."""
+    def find_blocks(self, keys: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+        """Return the numbers (n,) of the blocks of voxels, row by row, `width` in a row."""
         per_block = round(BLOCK_M / self.side)
         row, column = (
             (place - RULES.hold_columns) // per_block
             for place in np.divmod(keys >> BITS, self.width)
         )
-        number = row * shape[1] + column
-        return np.bincount(number, values, shape[0] * shape[1]).astype(np.int64).reshape(shape)
+        return row * width + column
 
 
 def find_detached(
     x: NDArray, y: NDArray, z: NDArray, cluster: int, gap: float, threads: int | None = None
 ) -> NDArray[np.uint8]:
-    """Return which points (n,) are `SOLID`, and which of the others `HELD`, `LOOSE` and `HEAVY`.
+    """Return which points (n,) are `SOLID`, and which of the others `HELD` and `LOOSE`.
 
     Parameters
     ----------
@@ -154,15 +154,15 @@ def find_detached(
         frame = Voxels.over(points, side)
         keys, counts = _count(points, near, frame, threads)
         company, voxels = _count_around(keys, counts, frame.width, threads)
-        sparse = RULES.min_mean * voxels
-        lonely = np.where(company < np.maximum(RULES.min_company, sparse), counts, 0)
-        lonely = sum_around(frame.sum_in_blocks(keys, lonely, shape))
+        least = RULES.min_around + RULES.min_more * np.maximum(0, voxels - 3)
+        lonely = np.where(company < np.maximum(RULES.min_company, least), counts, 0)
+        block = frame.find_blocks(keys, shape[1])
+        lonely = sum_around(np.bincount(block, lonely, count.size).reshape(shape))
         # Blocks whose voxels are too narrow are judged by the next wider ones, if there are any.
         scale[(scale == number) & (lonely > RULES.max_lonely * sum_around(count))] += 1
         if not (scale == number).any():
             continue
-        least = np.where(voxels <= RULES.max_line_voxels, RULES.min_around, sparse)
-        states = _judge(keys, counts, company >= least, most, frame, threads)
+        states = _judge(keys, counts, company >= least, most.ravel()[block], frame, threads)
         detached = np.zeros((keys[-1] >> BITS) + 1, np.bool_)
         detached[keys[states > SOLID] >> BITS] = True
         known = frame, (scale == number).ravel(), detached, keys, states
@@ -285,7 +285,7 @@ def _count_around(
 
 
 def _judge(keys, counts, full, most, frame: Voxels, threads: int | None) -> NDArray[np.uint8]:
-    """Return the states (n,) of voxels; `most` (h, w) are points of a cluster in each block."""
+    """Return the states (n,) of voxels; `most` (n,) are points of a cluster where each lies."""
     spans, parent = _spans(len(keys)), np.arange(len(keys))
 
     def join(span):
@@ -297,12 +297,11 @@ def _judge(keys, counts, full, most, frame: Voxels, threads: int | None) -> NDAr
     for _, end in spans[:-1]:  # what touches across the end of a span
         begin = np.searchsorted(keys, keys[end] - last_row)
         _join(keys, full, frame.width, begin, end, len(keys), parent)
-    alone = np.empty(len(keys), np.uint8)
-    _judge_components(keys, counts, full, parent, most, frame, RULES, alone)
-    state = alone.copy()
+    state = np.empty(len(keys), np.uint8)
+    _judge_components(keys, counts, full, parent, most, frame, RULES, state)
 
     def hold(span):
-        _hold(keys, alone, frame, *span, RULES, state)
+        _hold(keys, frame, *span, RULES, state)
 
     for _ in map_blocks(hold, spans, threads):
         pass
@@ -348,42 +347,51 @@ def _join(keys, full, width, begin, end, stop, parent):
 
 @njit
 def _judge_components(keys, counts, full, parent, most, frame, rules, state):
-    """Find the states of voxels by their components alone: `SOLID`, `HEAVY` or `LOOSE`.
+    """Find the states of voxels by their components alone.
 
-    Components are solid that are wide, or long and thin, heavy with more points than a cluster.
+    Solid are components that are wide, or long and thin. So are those of more points than a
+    cluster, unless they lie under others, and then they are held: ground in a courtyard or a pit
+    has no roof, echoes from below have the ground above them.
     """
-    number, label = 0, np.full(len(keys), -1)
+    first, label, number = np.empty(len(keys), np.int64), np.full(len(keys), -1), 0
     for k in range(len(keys)):
         if full[k]:
             root = root_of(parent, k)  # the first of its component
-            label[k] = number if root == k else label[root]
-            number += root == k
-    size, first = np.zeros(number, np.int64), np.full(number, -1)
+            if root == k:
+                first[number], label[k] = k, number
+                number += 1
+            label[k] = label[root]
+    size, covered = np.zeros((2, number), np.int64)
     low, high = np.zeros((number, 3), np.int64), np.zeros((number, 3), np.int64)
     sums = np.zeros((number, 6), np.int64)
     for k in range(len(keys)):
         if full[k]:
             n = label[k]
-            if first[n] < 0:
-                first[n] = k
             size[n] += counts[k]
             _extend(keys[first[n]], keys[k], frame.width, low[n], high[n], sums[n])
-    of_component = np.empty(number, np.uint8)
+    solid = np.empty(number, np.bool_)
+    longest = max(rules.extent_sides * frame.side, rules.extent_m)
     for n in range(number):
-        row, column = divmod(keys[first[n]] >> BITS, frame.width)
-        j = int((row - rules.hold_columns) * frame.side / BLOCK_M)
-        i = int((column - rules.hold_columns) * frame.side / BLOCK_M)
         flat = max(high[n, 0] - low[n, 0], high[n, 1] - low[n, 1])
         rise = (high[n, 2] - low[n, 2]) * frame.height
-        longest = max(rules.extent_sides * frame.side, rules.extent_m)
-        wide = max((flat + 1) * frame.side, rise) > longest
-        long = flat + 1 >= rules.line_columns and (flat + 1) * frame.side >= rules.line_m
-        if wide or (long and _is_line(sums[n], rise / (flat * frame.side), rules)):
-            of_component[n] = SOLID
-        else:
-            of_component[n] = HEAVY if size[n] > most[j, i] else LOOSE
+        solid[n] = max((flat + 1) * frame.side, rise) > longest
+        if flat + 1 >= rules.line_columns and (flat + 1) * frame.side >= rules.line_m:
+            solid[n] |= _is_line(sums[n], rise / (flat * frame.side), rules)
+    top = -1  # the component of a column's highest full voxel
+    for k in range(len(keys) - 1, -1, -1):
+        if k + 1 == len(keys) or keys[k + 1] >> BITS != keys[k] >> BITS:
+            top = -1
+        if full[k]:
+            top = label[k] if top < 0 else top
+            covered[label[k]] += counts[k] * (label[k] != top)
     for k in range(len(keys)):
-        state[k] = of_component[label[k]] if full[k] else LOOSE
+        state[k] = LOOSE
+        if full[k]:
+            n = label[k]
+            if solid[n]:
+                state[k] = SOLID
+            elif size[n] > most[first[n]]:
+                state[k] = HELD if covered[n] >= rules.min_covered * size[n] else SOLID
 
 
 @device
@@ -409,23 +417,17 @@ def _is_line(sums, slope, rules):
 
 
 @njit
-def _hold(keys, alone, frame, begin, end, rules, state):
-    """Find what has something solid close, as far up and down as a side: it holds what is detached.
-
-    What is heavy is solid then. `alone` (n,) are the states of :func:`_judge_components`.
-    """
+def _hold(keys, frame, begin, end, rules, state):
+    """Find which voxels of a span have something solid close, as far up and down as a side."""
     layers = int(np.ceil(rules.hold_sides * frame.side / frame.height))
     for k in range(begin, end):
-        if alone[k] == SOLID:
+        if state[k] != LOOSE:
             continue
         for j in range(-rules.hold_columns, rules.hold_columns + 1):
             for i in range(-rules.hold_columns, rules.hold_columns + 1):
                 at = keys[k] + ((j * frame.width + i) << BITS)
                 other = np.searchsorted(keys, at - layers)
                 while other < len(keys) and keys[other] <= at + layers:
-                    if alone[k] == HEAVY:
-                        if alone[other] == SOLID:
-                            state[k] = SOLID
-                    elif alone[other] != LOOSE:
+                    if state[other] == SOLID:
                         state[k] = HELD
                     other += 1

@@ -44,6 +44,7 @@ class LowRules(NamedTuple):
     support: int = 2  #: columns to each side in which ground as deep needs others of its level
     min_support: int = 2  #: columns there that differ by at most `level_m`: else it may be noise
     min_support_share: float = 0.2  #: this share of the columns there with points is needed besides
+    min_land: float = 0.0  #: share of the columns around the plane with such support, at least
     link: int = 3  #: cells of a minimum grid that are at most this far from each other are linked
     max_step_m: float = 0.35  #: height of a step across which cells are linked: a curb
     max_grade: float = 0.15  #: that step grows by this much per meter
@@ -52,6 +53,8 @@ class LowRules(NamedTuple):
 
 
 RULES = LowRules()
+#: Least depth in meters of low outliers of a minimum grid below the plane.
+DEPTH_M = 1.0
 #: How often what lies around a rank is halved before it is looked at; results do not depend on it.
 _HALVINGS = 8
 #: Rows that a thread takes at a time; results do not depend on it.
@@ -200,26 +203,56 @@ def _has_company(base, supported, side, j, i, z, plane, rules):
     return False
 
 
+@device
+def _has_land(base, supported, j, i, rules):
+    """Tell whether the columns that a plane is fitted through are land: many have support."""
+    h, w = base.shape
+    seen, land = 0, 0
+    for b in range(max(j - rules.near, 0), min(j + rules.near + 1, h)):
+        for a in range(max(i - rules.near, 0), min(i + rules.near + 1, w)):
+            if (b - j) ** 2 + (a - i) ** 2 <= rules.near**2:
+                seen += base[b, a] < np.inf
+                land += supported[b, a]
+    return land >= rules.min_land * seen
+
+
 @njit
-def _limits(low, base, supported, side, depth, rules, first, limit):
-    """Fill `limit`: below it low places are outliers; -inf where one may be ground."""
+def _judge_places(low, base, supported, side, depth, rules, first, levels):
+    """Fill the rows of `levels`: see :class:`Levels`."""
     near = np.empty((3, (2 * rules.near + 1) ** 2))
-    for j in range(first, first + len(limit)):
+    for j in range(first, first + levels.shape[1]):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:
                 continue
             plane = _plane_under(base, j, i, rules, near)
-            lowest = plane[0] - depth
-            if low[j, i] < lowest and not _has_company(
-                base, supported, side, j, i, low[j, i], plane, rules
+            if plane[0] == -np.inf:
+                continue
+            levels[0, j - first, i], lowest = plane[0], plane[0] - depth
+            if (
+                low[j, i] < lowest
+                and _has_land(base, supported, j, i, rules)
+                and not _has_company(base, supported, side, j, i, low[j, i], plane, rules)
             ):
-                limit[j - first, i] = lowest
+                levels[1, j - first, i] = lowest
 
 
-def limits_below_ground(
-    low: NDArray, base: NDArray, side: float, depth: float = 1.0, threads: int | None = 1
-) -> NDArray[np.float64]:
-    """Return the heights (h, w) below which low places are outliers, in meters; -inf where none is.
+class Levels(NamedTuple):
+    """Heights (h, w) in meters that low places are compared with."""
+
+    plane: NDArray[np.float64]  #: of the plane through the surroundings; inf where there is none
+    limit: NDArray[np.float64]  #: below it low places are outliers; -inf where one may be ground
+
+
+def find_levels(
+    low: NDArray,
+    base: NDArray,
+    side: float,
+    depth: float,
+    rules: LowRules,
+    threads: int | None = 1,
+    besides: NDArray[np.bool_] | None = None,
+) -> Levels:
+    """Return the heights (h, w) that low places are compared with.
 
     Parameters
     ----------
@@ -228,21 +261,27 @@ def limits_below_ground(
         is none.
     side, depth : float
         Side of a column, and least depth of outliers below the ground, in meters.
+    rules : LowRules
+        Thresholds.
     threads : int, optional
         Each takes some rows.
+    besides : (h, w), optional
+        Columns whose planes are wanted even if all around them lies lower.
     """
-    limit = np.full(low.shape, -np.inf)
+    levels = np.empty((2, *low.shape))
+    levels[0], levels[1] = np.inf, -np.inf
     # Where all around lies lower, no plane through it runs above.
     heights = np.where(np.isfinite(base), base, -HOLE).astype(np.float32)
-    low = np.where(low < highest_around(heights, RULES.near, 0), low, np.inf)
-    supported = _supported(base, RULES)
+    wanted = low < highest_around(heights, rules.near, 0)
+    low = np.where(wanted if besides is None else wanted | besides, low, np.inf)
+    supported = _supported(base, rules)
 
     def judge(first: int) -> None:
-        rows = limit[first : first + _BAND]
-        _limits(low, base, supported, side, depth, RULES, first, rows)
+        rows = levels[:, first : first + _BAND]
+        _judge_places(low, base, supported, side, depth, rules, first, rows)
 
     list(map_blocks(judge, range(0, len(low), _BAND), threads))
-    return limit
+    return Levels(*levels)
 
 
 def find_low_outliers(
@@ -262,7 +301,7 @@ def find_low_outliers(
     if not island.any():
         return island
     low, base = np.where(island, raster, HOLE), np.where(island, HOLE, raster)
-    return limits_below_ground(low, base, cell, threads=threads) > -np.inf
+    return find_levels(low, base, cell, DEPTH_M, RULES, threads).limit > -np.inf
 
 
 def outlier_reach(cell: float) -> int:
