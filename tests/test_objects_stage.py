@@ -50,6 +50,21 @@ def test_ids_of_points(town, tmp_path):
     assert figures["buildings"]["objects"] == len(np.unique(ids[(ids >> np.uint64(50)) == 1]))
 
 
+def test_a_reliability_that_one_input_lacks_is_not_taken_for_zero(town, tmp_path):
+    las = laspy.read(town)
+    east = np.asarray(las.x) > np.median(las.x)
+    las[~east].write(tmp_path / "west.laz")
+    las.add_extra_dim(laspy.ExtraBytesParams("Reliability", "f4"))
+    las["Reliability"] = np.full(len(las), 0.9, np.float32)
+    las[east].write(tmp_path / "east.laz")
+    vector = {"type": "writers.objects", "filename": str(tmp_path / "o.geojson")}
+    with pytest.raises(StageError, match="'Reliability' is missing in 1 input"):
+        Pipeline([*map(str, sorted(tmp_path.glob("*.laz"))), vector]).execute(arrays=False)
+    source = {"type": "readers.las", "filename": str(tmp_path / "*.laz")}
+    with pytest.raises(StageError, match="'Reliability' is missing in 1 input"):
+        ps.run_tiled([source, *stages("", tmp_path / "#.las")[1:]], 60, workers=0, progress=False)
+
+
 def test_tiles_give_the_same(town, tmp_path):
     Pipeline(stages(town, tmp_path / "whole.laz")).execute(arrays=False)
     run = ps.run_tiled(stages(town, tmp_path / "tiled.laz"), 60, workers=0, progress=False)

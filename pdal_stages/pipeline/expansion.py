@@ -232,7 +232,7 @@ def check_shared_dimensions(
     readings += [(len(expanded.stages), last)] if last else []
     for index, stage in readings:
         before = [(n, s) for n, s in enumerate(expanded.stages[:index]) if not is_reader(s)]
-        for name in stage.reads():
+        for name in (*stage.reads(), *stage.optional_reads()):
             lacking = [path for path, layout in with_points.items() if name not in layout.fields]
             if not 0 < len(lacking) < len(with_points) or _may_be_made(name, before, of_ours):
                 continue

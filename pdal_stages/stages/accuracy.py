@@ -16,6 +16,7 @@ from ..accuracy.labels import Merge
 from ..accuracy.measures import Accuracy
 from ..accuracy.text import by_file, summary
 from ..base.asprs import HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION, UNINFORMATIVE
+from ..base.dimensions import RELIABILITY
 from ..base.errors import StageError
 from ..base.files import HTML, JSON, Output, whole_files
 from ..base.json_types import JsonObject, StageJson
@@ -114,6 +115,10 @@ class AccuracyStage(Stage):
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
         return [self.dimension, self.reference]
+
+    def optional_reads(self) -> list[str]:
+        """Return the dimensions that are read where the points have them."""
+        return [RELIABILITY.name]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Compare the classes of the points and write what is asked for."""

@@ -280,6 +280,10 @@ class Stage(ABC):
         """Return the dimensions that the points must have, beyond X, Y and Z."""
         return []
 
+    def optional_reads(self) -> list[str]:
+        """Return the dimensions that are read where the points have them."""
+        return []
+
     def written_dimensions(self) -> Sequence[Dimension]:
         """Return the dimensions that are written."""
         return ()

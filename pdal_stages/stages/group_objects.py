@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.dimensions import OBJECT_ID, Dimension
+from ..base.dimensions import OBJECT_ID, RELIABILITY, Dimension
 from ..base.errors import StageError
 from ..base.json_types import JsonObject
 from ..objects.cells import (
@@ -53,6 +53,10 @@ class ObjectOptions:
     ignore: Selection = ignore_option("Points that belong to no object")
 
     options: JsonObject
+
+    def optional_reads(self) -> list[str]:
+        """Return the dimensions that are read where the points have them."""
+        return [RELIABILITY.name]
 
     @cached_property
     def settings(self) -> ObjectSettings:
