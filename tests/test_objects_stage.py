@@ -63,6 +63,9 @@ def test_a_reliability_that_one_input_lacks_is_not_taken_for_zero(town, tmp_path
     source = {"type": "readers.las", "filename": str(tmp_path / "*.laz")}
     with pytest.raises(StageError, match="'Reliability' is missing in 1 input"):
         ps.run_tiled([source, *stages("", tmp_path / "#.las")[1:]], 60, workers=0, progress=False)
+    heights = {"type": "filters.hag_minima", "where": "reliability > 0.5"}
+    with pytest.raises(StageError, match="'reliability' is missing in 1 input"):
+        Pipeline([source, heights]).execute()
 
 
 def test_tiles_give_the_same(town, tmp_path):

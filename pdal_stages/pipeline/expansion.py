@@ -218,6 +218,10 @@ def check_dimensions(expanded: Expanded) -> None:
                 )
 
 
+#: Dimensions of LAS 1.4 that earlier files need not have to say the same.
+_ZERO_WHERE_ABSENT = ("overlap", "scanchannel", "classflags")
+
+
 def check_shared_dimensions(
     expanded: Expanded, layouts: Mapping[str, Layout], last: Stage | None = None
 ) -> None:
@@ -233,8 +237,13 @@ def check_shared_dimensions(
     for index, stage in readings:
         before = [(n, s) for n, s in enumerate(expanded.stages[:index]) if not is_reader(s)]
         for name in (*stage.reads(), *stage.optional_reads()):
-            lacking = [path for path, layout in with_points.items() if name not in layout.fields]
-            if not 0 < len(lacking) < len(with_points) or _may_be_made(name, before, of_ours):
+            lacking = [
+                path
+                for path, layout in with_points.items()
+                if name.lower() not in map(str.lower, layout.fields)
+            ]
+            harmless = name.lower() in _ZERO_WHERE_ABSENT or _may_be_made(name, before, of_ours)
+            if harmless or not 0 < len(lacking) < len(with_points):
                 continue
             raise DimensionError(
                 f"the dimension '{name}' is missing in {count_of(len(lacking), 'input')}, and "

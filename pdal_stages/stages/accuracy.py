@@ -54,6 +54,7 @@ class AccuracyStage(Stage):
     )
     where_help = "Only points inside are compared"
     needs_points = "compare"
+    optional_dimensions = (RELIABILITY.name,)
     dimension: str = option("string", "Classification", "The classes to judge")
     reference: str = option("string", "Reference", "The true classes, e.g. kept with filters.ferry")
     classes: list[int] = option(
@@ -115,10 +116,6 @@ class AccuracyStage(Stage):
     def reads(self) -> list[str]:
         """Return the dimensions that the points must have."""
         return [self.dimension, self.reference]
-
-    def optional_reads(self) -> list[str]:
-        """Return the dimensions that are read where the points have them."""
-        return [RELIABILITY.name]
 
     def run(self, points: Points, context: StageContext) -> dict[str, NDArray]:
         """Compare the classes of the points and write what is asked for."""

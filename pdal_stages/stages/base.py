@@ -147,6 +147,8 @@ class Stage(ABC):
     source: ClassVar[str] = ""
     #: What becomes of the points outside `where`.
     where_help: ClassVar[str] = ""
+    #: Dimensions that are read where the points have them.
+    optional_dimensions: ClassVar[tuple[str, ...]] = ()
     #: Whether `where` only selects what to compute: tiles compute only results that are used.
     where_chooses: ClassVar[bool] = False
     #: Verb for the error on missing points ("there are no points to train on"); empty where a run
@@ -281,8 +283,8 @@ class Stage(ABC):
         return []
 
     def optional_reads(self) -> list[str]:
-        """Return the dimensions that are read where the points have them."""
-        return []
+        """Return the dimensions that are read where the points have them, by names in any case."""
+        return [*self.optional_dimensions, *(self._condition.names if self._condition else ())]
 
     def written_dimensions(self) -> Sequence[Dimension]:
         """Return the dimensions that are written."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,7 @@ def _codes(name: str, what: str) -> Any:
 class ObjectOptions:
     """Options that the stages of objects share: those of the search, and which classes are what."""
 
+    optional_dimensions: ClassVar[tuple[str, ...]] = (RELIABILITY.name,)
     ground: list[int] = _codes("ground", "the ground, and of water")
     buildings: list[int] = _codes("buildings", "buildings, roofs and facades")
     trees: list[int] = _codes("trees", "vegetation that trees are looked for in")
@@ -53,10 +54,6 @@ class ObjectOptions:
     ignore: Selection = ignore_option("Points that belong to no object")
 
     options: JsonObject
-
-    def optional_reads(self) -> list[str]:
-        """Return the dimensions that are read where the points have them."""
-        return [RELIABILITY.name]
 
     @cached_property
     def settings(self) -> ObjectSettings:

@@ -68,8 +68,8 @@ class Expression:
         try:
             self._root = ast.parse(python, mode="eval").body
             names = (node.id[1:] for node in ast.walk(self._root) if isinstance(node, ast.Name))
-            self._names = sorted(set(names))
-            tried = self._evaluate(self._root, dict.fromkeys(self._names, np.zeros(0)))
+            self.names = sorted(set(names))  #: of dimensions, in any case
+            tried = self._evaluate(self._root, dict.fromkeys(self.names, np.zeros(0)))
         except SyntaxError:
             raise self._error("it is not a condition of this form") from None
         except (MemoryError, RecursionError):
@@ -89,7 +89,7 @@ class Expression:
 
     def check(self, names: Collection[str]) -> None:
         """Refuse names that are not among those of dimensions; errors as of :meth:`evaluate`."""
-        for name in self._names:
+        for name in self.names:
             _find(name, names)
 
     def evaluate(self, arrays: _Values) -> NDArray[np.bool_]:
@@ -100,7 +100,7 @@ class Expression:
         DimensionError
             If it names a dimension the points do not have.
         """
-        values = {name: arrays[_find(name, arrays)] for name in self._names}
+        values = {name: arrays[_find(name, arrays)] for name in self.names}
         size = len(next(iter(arrays.values()))) if arrays else 0
         return np.broadcast_to(self._evaluate(self._root, values), (size,)).copy()
 
