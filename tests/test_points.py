@@ -6,6 +6,7 @@ import pytest
 from pdal_stages.base.errors import DimensionError
 from pdal_stages.stages.bridges import Bridges
 from pdal_stages.stages.points import Points
+from pdal_stages.stages.where_expression import Expression
 
 
 def arrays(n=1000):
@@ -55,3 +56,22 @@ def test_a_height_in_feet_is_told_by_its_dimension_not_by_its_prefix():
     points = Points({**arrays(), **values, **meters}, unit_names=("foot", "foot"))
     assert all((points.dimension(name) == 3.048).all() for name in values)
     assert all((points.dimension(name) == 10.0).all() for name in meters)
+
+
+def test_a_condition_names_flags_that_old_pdal_keeps_in_other_dimensions():
+    """As in tiles and `classify`, which read the flags themselves."""
+    axes = {axis: np.arange(4.0) for axis in "XYZ"}
+    bits = np.array([0, 1, 4, 12], np.uint8)  # none, synthetic, withheld, withheld and overlap
+    wanted = {
+        "withheld == 1": [False, False, True, True],
+        "Synthetic == 0": [True, False, True, True],
+    }
+    for condition, mask in wanted.items():
+        where = Expression(condition)
+        assert Points({**axes, "ClassFlags": bits}, where=where).mask.tolist() == mask
+        old = {**axes, "Classification": 2 + ((bits & 7) << 5).astype(np.uint8)}
+        assert Points(old, where=where, legacy_flags=True).mask.tolist() == mask
+    overlap = Expression("Overlap == 1")
+    assert Points({**axes, "ClassFlags": bits}, where=overlap).mask.tolist() == [False] * 3 + [True]
+    with pytest.raises(DimensionError, match="names the dimension 'Overlap'"):
+        Points(old, where=overlap, legacy_flags=True)

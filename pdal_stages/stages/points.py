@@ -89,7 +89,8 @@ class Points:
         self.mask = self.used
         if self.where is not None:
             codes = {"Classification": self.class_codes} if self.legacy_flags else {}
-            self.mask = self.where.evaluate(ChainMap(codes, cast(dict, self.arrays)))
+            flags = self._flags_of(self.where)
+            self.mask = self.where.evaluate(ChainMap(codes, flags, cast(dict, self.arrays)))
             if self.used is not None:
                 self.mask &= self.used
             self.report.figures["where"] = int(np.count_nonzero(self.mask))
@@ -271,6 +272,16 @@ class Points:
         if self.legacy_flags and name != "Overlap":
             return self.arrays["Classification"] >> np.uint8(LEGACY_LIMIT.bit_length() + bit) & 1
         return np.zeros(self.count, np.uint8)
+
+    def _flags_of(self, where: Expression) -> dict[str, NDArray]:
+        """Return the flags (n,) that a condition names and old PDAL has no dimension for."""
+        held = ("ClassFlags" in self.arrays and _FLAGS) or (self.legacy_flags and _FLAGS[:3]) or ()
+        wanted = {name.lower() for name in where.names}
+        return {
+            name: self.flag(name)
+            for name in held
+            if name.lower() in wanted and name not in self.arrays
+        }
 
     def chosen(self, selection: Selection) -> NDArray[np.bool_]:
         """Return which points (n,) a selection takes."""
