@@ -53,9 +53,10 @@ WIRE_SAMPLES, TOWER_SAMPLES = 30, 6
 #: Points per square meter of the thinnest copies that have these: in thinner ones a wire is a few
 #: points that could be anything.
 LINE_DENSITY = 1.5
-#: And of vegetation and building each that looks like a wire, beside the samples of the survey:
-#: higher than :data:`LONE_HEIGHT` meters, on a line of 20 neighbors.
-LONE_SAMPLES, LONE_HEIGHT, LONE_LINEARITY = 200, 3.0, 0.6
+#: And of vegetation and building each that looks like a wire, and of vegetation that looks like a
+#: roof, beside the samples of the survey: higher than :data:`SHAPED_HEIGHT` meters, on a line or in
+#: a plane of 20 neighbors.
+SHAPED_SAMPLES, SHAPED_HEIGHT, LEAST_SHAPE = 200, 3.0, 0.6
 #: Heights that models read.
 HEIGHTS = ("HeightAboveGround", "HeightAboveOpening_5", "HeightAboveOpening_17")
 #: Features of 20 and of 50 neighbors.
@@ -143,24 +144,28 @@ def training_cloud(cloud: Cloud) -> TrainingCloud:
     for code, most in samples.items():
         mask[order[usable[order] == code][:most]] = True
     tree = cKDTree(cloud.xyz)
-    high = cloud.dimensions["HeightAboveGround"][order] > LONE_HEIGHT
-    for code in (VEGETATION, BUILDING):
+    high = cloud.dimensions["HeightAboveGround"][order] > SHAPED_HEIGHT
+    for code, planar in ((VEGETATION, False), (BUILDING, False), (VEGETATION, True)):
         rows = order[high & (usable[order] == code)]
-        mask[lone(cloud.xyz, tree, rows)] = True
+        mask[shaped(cloud.xyz, tree, rows, planar)] = True
     return replace(whole, mask=mask)
 
 
-def lone(xyz: np.ndarray, tree: cKDTree, rows: np.ndarray) -> np.ndarray:
-    """Return the first :data:`LONE_SAMPLES` of the rows (m,) whose neighbors lie along a line."""
+def shaped(xyz: np.ndarray, tree: cKDTree, rows: np.ndarray, planar: bool) -> np.ndarray:
+    """Return the first :data:`SHAPED_SAMPLES` of the rows (m,) whose neighbors lie along a line.
+
+    With `planar`, those whose neighbors lie in a plane.
+    """
     out: list[np.ndarray] = []
     for part in np.array_split(rows, max(1, len(rows) // 1000)):
-        if not len(part) or sum(map(len, out)) >= LONE_SAMPLES or len(xyz) < 20:
+        if not len(part) or sum(map(len, out)) >= SHAPED_SAMPLES or len(xyz) < 20:
             break
         near = xyz[tree.query(xyz[part], 20)[1]]
         near -= near.mean(axis=1, keepdims=True)
-        values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", near, near))
-        out.append(part[values[:, 2] - values[:, 1] > LONE_LINEARITY * values[:, 2]])
-    return np.concatenate([np.zeros(0, np.int64), *out])[:LONE_SAMPLES]
+        low, middle, high = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", near, near)).T
+        shape = middle - low if planar else high - middle
+        out.append(part[shape > LEAST_SHAPE * high])
+    return np.concatenate([np.zeros(0, np.int64), *out])[:SHAPED_SAMPLES]
 
 
 def contradicted(cloud: Cloud | TrainingCloud) -> np.ndarray:
