@@ -95,7 +95,8 @@ def main() -> None:
         in_tree = np.hypot(x - SECTION[0], y - SECTION[1]) < 4.0
         wrong = np.flatnonzero(in_tree & (codes == 6) & (truth == 5))
         worst = json.loads((folder / "review.json").read_text())["worst"]
-        east, north = next(row["at"] for row in worst if "building" in row["reason"])
+        patches = [row["at"] for row in worst]
+        east, north = next(at for at in patches if np.hypot(*np.subtract(at, SECTION[:2])) < 4.0)
         nearest = wrong[np.argmin(np.hypot(x[wrong] - east, y[wrong] - north))]
         place = [f"{np.array(axis)[nearest]:.2f}" for axis in (cloud.x, cloud.y, cloud.z)]
         run("explain", first, *place)

@@ -22,6 +22,7 @@ from recipe import (
     MOST,
     ONE_RETURN,
     OPTIONS,
+    SHAPED_SAMPLES,
     TOWER_SAMPLES,
     WIRE_SAMPLES,
 )
@@ -168,6 +169,7 @@ def pages() -> dict[Path, str]:
         "wires": describe_wires(wires),
         "wire_samples": WIRE_SAMPLES,
         "tower_samples": TOWER_SAMPLES,
+        "shaped_samples": SHAPED_SAMPLES,
         "line_density": LINE_DENSITY,
         "most": MOST,
         "above": ABOVE,
