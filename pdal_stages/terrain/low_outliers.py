@@ -218,22 +218,22 @@ def _has_land(base, supported, j, i, rules):
 
 @njit
 def _judge_places(low, base, supported, side, depth, rules, first, levels):
-    """Fill the rows of `levels`: see :class:`Levels`."""
+    """Fill the rows (m, w) of `levels`, the first of which is the row `first`."""
     near = np.empty((3, (2 * rules.near + 1) ** 2))
-    for j in range(first, first + levels.shape[1]):
+    for j in range(first, first + len(levels.plane)):
         for i in range(low.shape[1]):
             if low[j, i] == np.inf:
                 continue
             plane = _plane_under(base, j, i, rules, near)
             if plane[0] == -np.inf:
                 continue
-            levels[0, j - first, i], lowest = plane[0], plane[0] - depth
+            levels.plane[j - first, i], lowest = plane[0], plane[0] - depth
             if (
                 low[j, i] < lowest
                 and _has_land(base, supported, j, i, rules)
                 and not _has_company(base, supported, side, j, i, low[j, i], plane, rules)
             ):
-                levels[1, j - first, i] = lowest
+                levels.limit[j - first, i] = lowest
 
 
 class Levels(NamedTuple):
@@ -268,8 +268,7 @@ def find_levels(
     besides : (h, w), optional
         Columns whose planes are wanted even if all around them lies lower.
     """
-    levels = np.empty((2, *low.shape))
-    levels[0], levels[1] = np.inf, -np.inf
+    levels = Levels(np.full(low.shape, np.inf), np.full(low.shape, -np.inf))
     # Where all around lies lower, no plane through it runs above.
     heights = np.where(np.isfinite(base), base, -HOLE).astype(np.float32)
     wanted = low < highest_around(heights, rules.near, 0)
@@ -277,11 +276,11 @@ def find_levels(
     supported = _supported(base, rules)
 
     def judge(first: int) -> None:
-        rows = levels[:, first : first + _BAND]
+        rows = Levels(*(each[first : first + _BAND] for each in levels))
         _judge_places(low, base, supported, side, depth, rules, first, rows)
 
     list(map_blocks(judge, range(0, len(low), _BAND), threads))
-    return Levels(*levels)
+    return levels
 
 
 def find_low_outliers(
