@@ -413,8 +413,10 @@ def density_of(xyz: np.ndarray) -> float:
 
 
 def wooded(xyz: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Return which points lie in squares of 20 m with trees of 8 m, half of the points or more, and
-    hardly any buildings."""
+    """Return which points (n,) lie in woods, by squares of 20 m.
+
+    More than half of a square's points are plants, which are 8 m high; hardly any are buildings.
+    """
     square = np.unique(np.floor(xyz[:, :2] / 20), axis=0, return_inverse=True)[1]
     count = np.bincount(square)
     low, high = np.full((2, len(count)), np.nan)

@@ -68,6 +68,19 @@ def test_a_reliability_that_one_input_lacks_is_not_taken_for_zero(town, tmp_path
         Pipeline([source, heights]).execute()
 
 
+def test_a_dimension_that_one_input_lacks_and_a_stage_makes_is_read_by_any_case(town, tmp_path):
+    las = laspy.read(town)
+    east = np.asarray(las.x) > np.median(las.x)
+    las[~east].write(tmp_path / "west.laz")
+    las.add_extra_dim(laspy.ExtraBytesParams("HeightAboveGround", "f8"))
+    las[east].write(tmp_path / "east.laz")
+    source = {"type": "readers.las", "filename": str(tmp_path / "*.laz")}
+    noise = {"type": "filters.detachednoise", "where": "heightaboveground > 2"}
+    with pytest.raises(StageError, match="'heightaboveground' is missing in 1 input"):
+        Pipeline([source, noise]).execute()
+    Pipeline([source, {"type": "filters.hag_minima"}, noise]).execute()
+
+
 def test_tiles_give_the_same(town, tmp_path):
     Pipeline(stages(town, tmp_path / "whole.laz")).execute(arrays=False)
     run = ps.run_tiled(stages(town, tmp_path / "tiled.laz"), 60, workers=0, progress=False)

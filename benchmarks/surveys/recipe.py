@@ -53,9 +53,9 @@ WIRE_SAMPLES, TOWER_SAMPLES = 30, 6
 #: Points per square meter of the thinnest copies that have these: in thinner ones a wire is a few
 #: points that could be anything.
 LINE_DENSITY = 1.5
-#: And of vegetation and building each that looks like a wire, and of vegetation that looks like a
-#: roof, beside the samples of the survey: higher than :data:`SHAPED_HEIGHT` meters, on a line or in
-#: a plane of 20 neighbors.
+#: Samples of a copy beside those that its survey gives: of vegetation and of building that look
+#: like wires, each, and of vegetation that looks like roofs. They lie higher than
+#: :data:`SHAPED_HEIGHT` meters, and their 20 neighbors on a line or in a plane.
 SHAPED_SAMPLES, SHAPED_HEIGHT, LEAST_SHAPE = 200, 3.0, 0.6
 #: Heights that models read.
 HEIGHTS = ("HeightAboveGround", "HeightAboveOpening_5", "HeightAboveOpening_17")
@@ -147,14 +147,14 @@ def training_cloud(cloud: Cloud) -> TrainingCloud:
     high = cloud.dimensions["HeightAboveGround"][order] > SHAPED_HEIGHT
     for code, planar in ((VEGETATION, False), (BUILDING, False), (VEGETATION, True)):
         rows = order[high & (usable[order] == code)]
-        mask[shaped(cloud.xyz, tree, rows, planar)] = True
+        mask[choose_shaped(cloud.xyz, tree, rows, planar)] = True
     return replace(whole, mask=mask)
 
 
-def shaped(xyz: np.ndarray, tree: cKDTree, rows: np.ndarray, planar: bool) -> np.ndarray:
+def choose_shaped(xyz: np.ndarray, tree: cKDTree, rows: np.ndarray, planar: bool) -> np.ndarray:
     """Return the first :data:`SHAPED_SAMPLES` of the rows (m,) whose neighbors lie along a line.
 
-    With `planar`, those whose neighbors lie in a plane.
+    With `planar`, they are those whose neighbors lie in a plane.
     """
     out: list[np.ndarray] = []
     for part in np.array_split(rows, max(1, len(rows) // 1000)):

@@ -58,7 +58,7 @@ class LineEvidenceRules(NamedTuple):
     side: float = 0.5  #: evidence in the tube on either side of what is no guide, at least
     length: float = 10.0  #: least extent of a line
     gap: float = 16.0  #: largest gap in it: thin wires give few echoes, ...
-    usual_gaps: float = 12.0  #: ... and the same in usual gaps: those of others lie at equal steps
+    usual_gaps: float = 12.0  #: ... and in median gaps of the line: echoes of wires lie evenly
     radius: float = 32.0  #: candidates up to this far away, in plan, are looked at
     width: float = 0.4  #: radius of the tube: a wire sags, and its echoes scatter by 0.1 m
     ring: float = 1.2  #: outer radius of the ring around it

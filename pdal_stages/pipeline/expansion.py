@@ -218,7 +218,7 @@ def check_dimensions(expanded: Expanded) -> None:
                 )
 
 
-#: Dimensions of LAS 1.4 that earlier files need not have to say the same.
+#: Dimensions that LAS 1.4 added, in lower case: points of earlier files without them have 0 there.
 _ZERO_WHERE_ABSENT = ("overlap", "scanchannel", "classflags")
 
 
@@ -257,9 +257,14 @@ def check_shared_dimensions(
 def _may_be_made(
     name: str, before: Iterable[tuple[int, StageJson]], of_ours: Mapping[int, Mapping[str, str]]
 ) -> bool:
-    """Return whether a stage before, by its index, may make a dimension; `of_ours` are known to."""
+    """Return whether one of the stages before, by their indexes, may make a dimension.
+
+    `of_ours` are the dimensions that stages of ours make, by index. The name is in any case.
+    """
     return any(
-        name in of_ours[index] if index in of_ours else _may_create(name, stage)
+        name.lower() in map(str.lower, of_ours[index])
+        if index in of_ours
+        else _may_create(name, stage)
         for index, stage in before
     )
 

@@ -14,7 +14,7 @@ _DRIVER_CURE = (
     "libpdal_plugin_filter_python"
 )
 _CUT_POINTS = re.compile(r"readers\.las: .*(reading point \d+ of \d+|[Cc]ouldn't read .*point)")
-#: The command where no file is PDAL's.
+#: The command that reads and writes all files itself, without PDAL, for hints.
 COPIES = "pdal-stages classify (LAS to LAS, an output for each input)"
 FLAGS_IN_CLASSES = (
     "this PDAL reads the flags (synthetic, key-point, withheld) of LAS 1.0-1.3 as parts of the "

@@ -73,7 +73,7 @@ DIFFERENCE: Sequence[Row[Explanation]] = (
         lambda v: not v.kept,
     ),
 )
-_LONE = "yes, {code:class}: alone or in a small cluster, "
+_LONE = "yes, {code:class}: alone or in a cluster apart from all else, "
 #: The first row that applies.
 NOISE: Sequence[Row[Noise]] = (
     Row("noise", _LONE + "below the ground", lambda v: v.code == 7),
@@ -83,7 +83,11 @@ NOISE: Sequence[Row[Noise]] = (
         "no: it belongs to something large, with points close to each other",
         lambda v: v.state == "solid",
     ),
-    Row("noise", "no: it stands apart, but near something large", lambda v: v.state == "held"),
+    Row(
+        "noise",
+        "no: it stands apart, but near or under something large",
+        lambda v: v.state == "held",
+    ),
     Row(
         "noise",
         "not judged: it is left out, or there are too few points",

@@ -5,8 +5,9 @@ and crowns of a survey fill voxels that touch. They are widened where more than 
 little company; where that is so in the widest, as in thin clouds of steep forests, gaps tell
 nothing, and nothing is detached. A voxel is solid if it belongs to a component of voxels that
 touch, none of them nearly empty, and that is large, long and thin as a wire, or of many points
-under the open sky. All else is detached: held if something solid is close, loose if not. All is
-counted on absolute grids, so that the order of points, tiles and threads do not matter.
+under the open sky. All else is detached: held if something solid is close or if it has many points
+under others, loose if not. All is counted on absolute grids, so that the order of points, tiles and
+threads do not matter.
 """
 
 from __future__ import annotations
@@ -349,8 +350,8 @@ def _join(keys, full, width, begin, end, stop, parent):
 def _judge_components(keys, counts, full, parent, most, frame, rules, state):
     """Find the states of voxels by their components alone.
 
-    Solid are components that are wide, or long and thin. So are those of more points than a
-    cluster, unless they lie under others, and then they are held: ground in a courtyard or a pit
+    Components are solid that are wide, or long and thin. Those of more points than a cluster are
+    solid, too, unless they lie under others, and then they are held: ground in a courtyard or a pit
     has no roof, echoes from below have the ground above them.
     """
     first, label, number = np.empty(len(keys), np.int64), np.full(len(keys), -1), 0

@@ -250,7 +250,7 @@ def find_levels(
     depth: float,
     rules: LowRules,
     threads: int | None = 1,
-    besides: NDArray[np.bool_] | None = None,
+    needs_plane: NDArray[np.bool_] | None = None,
 ) -> Levels:
     """Return the heights (h, w) that low places are compared with.
 
@@ -265,14 +265,14 @@ def find_levels(
         Thresholds.
     threads : int, optional
         Each takes some rows.
-    besides : (h, w), optional
-        Columns whose planes are wanted even if all around them lies lower.
+    needs_plane : (h, w) bool, optional
+        Columns that get a plane even if all around them lies lower.
     """
     levels = Levels(np.full(low.shape, np.inf), np.full(low.shape, -np.inf))
     # Where all around lies lower, no plane through it runs above.
     heights = np.where(np.isfinite(base), base, -HOLE).astype(np.float32)
     wanted = low < highest_around(heights, rules.near, 0)
-    low = np.where(wanted if besides is None else wanted | besides, low, np.inf)
+    low = np.where(wanted if needs_plane is None else wanted | needs_plane, low, np.inf)
     supported = _supported(base, rules)
 
     def judge(first: int) -> None:
@@ -300,7 +300,7 @@ def find_low_outliers(
     if not island.any():
         return island
     low, base = np.where(island, raster, HOLE), np.where(island, HOLE, raster)
-    return find_levels(low, base, cell, DEPTH_M, RULES, threads).limit > -np.inf
+    return find_levels(low, base, cell, DEPTH_M, rules, threads).limit > -np.inf
 
 
 def outlier_reach(cell: float) -> int:

@@ -267,7 +267,7 @@ class Survey:
 
     @property
     def system(self) -> list[object]:
-        """The units and the projection of the coordinates, however a file words them."""
+        """Return the units and the projection of the coordinates, however a file words them."""
         return [vars(self.reference.units), sorted(self.reference.plane)]
 
     def warnings_of_boxes(self) -> list[Message]:

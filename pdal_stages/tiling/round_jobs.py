@@ -62,21 +62,22 @@ class RoundJobs:
         return jobs
 
     @cached_property
-    def lost(self) -> list[list[tuple[int, int]]]:
-        """The squares of each round before the last that have no record, but whose tiles have one.
+    def squares_without_record(self) -> list[list[tuple[int, int]]]:
+        """Return the squares of each round before the last that lack a record which reports need.
 
-        Or will have one: tiles that are kept without a record are in no report.
+        Reports need those of squares whose tiles have a record or will have one: tiles that are
+        kept without a record are in no report.
         """
         reported = {
             self.run.square_of(job)
             for job in self.run.tiles
             if job.state == "waiting" or job.record is not None
         }
-        lost = []
+        without = []
         for number in range(len(self.run.plan.rounds) - 1):
             jobs = [self._square_job(number, square) for square in sorted(reported)]
-            lost.append([j.tile for j in jobs if not self.run.store.record(j.name, j.digest)])
-        return lost
+            without.append([j.tile for j in jobs if not self.run.store.record(j.name, j.digest)])
+        return without
 
     @cached_property
     def _points_of_squares(self) -> dict[tuple[int, int], int]:
@@ -95,7 +96,8 @@ class RoundJobs:
         grid, every, unit = context.grid_of(number + 1), self._points_of_squares, survey.unit
         names = {square: f"{square_name(context, number, square)}.npz" for square in every}
         self.run.store.remove(f".round{number}.npz", names.values())
-        squares = {place: self._square_job(number, place) for place in self.lost[number]}
+        first = self.squares_without_record[number]
+        squares = {square: self._square_job(number, square) for square in first}
         blocks: dict[tuple[int, int], BlockJob] = {}
 
         def squares_in(box: Box) -> list[TileJob]:

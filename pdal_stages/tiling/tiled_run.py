@@ -28,7 +28,7 @@ from .plan import TilePlan, make_plan
 from .plan_run import PlanRun
 from .round_jobs import RoundJobs
 from .survey_run import workers_of
-from .write_outputs import copy_in
+from .write_outputs import plan_copy
 
 
 def run_tiled(
@@ -118,7 +118,8 @@ def run_plan(
                 rounds = RoundJobs(run)
                 if chosen.resume:
                     run.take_over()
-                    run.read_inputs(run.inputs_of_waiting({*chain(*rounds.lost)}))
+                    squares = {*chain(*rounds.squares_without_record)}
+                    run.read_inputs(run.inputs_of_waiting(squares))
                 interrupted = True
                 with contextlib.suppress(KeyboardInterrupt):
                     rounds.make()
@@ -145,7 +146,7 @@ def _refuse_misread(plan: TilePlan, survey: Survey, together: bool) -> None:
 def _refuse_uncopied(plan: TilePlan, survey: Survey) -> None:
     """Refuse inputs of which no copy can be written with what stages create."""
     for source, layout in _layouts(survey):
-        copy_in(plan, source, layout, ".las", {})
+        plan_copy(plan, source, layout, ".las", {})
 
 
 def _refuse_lacking(pipeline: Pipeline, survey: Survey) -> None:

@@ -165,7 +165,7 @@ def run_tail(
     return OutputRecord(describe_written(outputs), run.count, classes)
 
 
-def copy_in(
+def plan_copy(
     plan: TilePlan, source: InputSource, layout: Layout, target: str, types: Mapping[str, np.dtype]
 ) -> LasCopy:
     """Return a copy of an input with the dimensions of a plan; `types` are those of new values."""
@@ -198,7 +198,7 @@ def write_file(
                 at += len(records)
 
     types = result_types(results, source)
-    copy = copy_in(plan, source, layout, outputs[0] if plan.copied else ".las", types)
+    copy = plan_copy(plan, source, layout, outputs[0] if plan.copied else ".las", types)
     return run_tail([(source, copy, parts())], plan, outputs, scratch)
 
 
@@ -210,6 +210,6 @@ def write_tile(
     for piece, rows, values in ((r.piece, r.rows, r.values) for r in results):
         if piece.own_rows.size:  # only the tile's own points remain
             types = {name: column.dtype for name, column in values.items()}
-            copy = copy_in(plan, piece.source, piece.layout, ".las", types)
+            copy = plan_copy(plan, piece.source, piece.layout, ".las", types)
             copies.append((piece.source, copy, [(piece.records[rows], values)]))
     return run_tail(copies, plan, outputs, scratch) if copies else OutputRecord([])
