@@ -28,7 +28,9 @@ INPUT = "PdalStagesInput"
 #: Meters outside the tile; negative inside.
 OUTSIDE = "PdalStagesOutside"
 
-#: Fields of a plan of which each result depends on a part alone, or none at all.
+#: Fields of a plan on which not all results depend. Each job has a part of the first (its inputs,
+#: its stages, its output), which its own digest holds; the second tell what was read and how it is
+#: reported, of which the digests of inputs and stages know all that matters.
 _APART = {"readers", "in_tiles", "rounds", "per_output", "files", "sees_m", "creates"}
 _APART |= {"messages", "name", "extra_dims", "makes"}
 
