@@ -231,17 +231,17 @@ def check_shared_dimensions(
     pipeline.
     """
     of_ours = {ours.index: ours.stage.creates() for ours in expanded.ours}
-    with_points = {path: each for path, each in layouts.items() if each.header.count}
+    with_points = {
+        path: {*map(str.lower, layout.fields)}
+        for path, layout in layouts.items()
+        if layout.header.count
+    }
     readings = [(ours.index, ours.stage) for ours in expanded.ours]
     readings += [(len(expanded.stages), last)] if last else []
     for index, stage in readings:
         before = [(n, s) for n, s in enumerate(expanded.stages[:index]) if not is_reader(s)]
         for name in (*stage.reads(), *stage.optional_reads()):
-            lacking = [
-                path
-                for path, layout in with_points.items()
-                if name.lower() not in map(str.lower, layout.fields)
-            ]
+            lacking = [path for path, names in with_points.items() if name.lower() not in names]
             harmless = name.lower() in _ZERO_WHERE_ABSENT or _may_be_made(name, before, of_ours)
             if harmless or not 0 < len(lacking) < len(with_points):
                 continue

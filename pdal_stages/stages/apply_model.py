@@ -205,8 +205,8 @@ class ApplyModel(Stage, settings=PredictionOptions):
         if self.part == LINES:
             return "Leave out the option 'part', which is for tiles"
         if self.preparation:
-            made = as_json(self.preparation)
-            return f"Put before this stage: {made}; what these do not make must be in the input"
+            stages = as_json(self.preparation)
+            return f"Put before this stage: {stages}; what these do not make must be in the input"
         by_hand = ", ".join(self.model.info.get("by_hand", ()))
         return by_hand and f"Put before this stage what stood there in training: {by_hand}"
 
